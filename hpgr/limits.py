@@ -1,0 +1,66 @@
+"""Closed forms of crushing without cushioning (n = inf), run to completion.
+
+Without cushioning a grain breaks until it is finer than the critical size
+s_c = s_m (sigma_a / sigma_m)^(-w/3), and only the smallest s_c it has met matters. They serve scenes with
+n = inf as a solver without sampling, and everything else as an oracle. They are the limit of small time
+steps: the lattice breaks a grain once per step, the closed forms as often as it takes.
+"""
+
+import numpy as np
+
+from hpgr import feed as feeds
+from hpgr.scene import Feed, Material
+
+_FINEST = 1e-30  # m, below any grain; where percentiles are searched from
+
+
+def critical_size(log_stress, material: Material) -> np.ndarray:
+    """Return the size in m above which grains break at log(sigma_a / sigma_m), at least the size floor.
+
+    inf where there is no stress (log_stress = -inf).
+    """
+    with np.errstate(over="ignore"):  # a vanishing stress breaks no size: inf is the answer
+        size = material.strength_size * np.exp(-np.asarray(log_stress) * (material.weibull_modulus / 3))
+    return np.maximum(size, material.size_floor)
+
+
+def crushed_passing(feed: Feed, size, critical, gamma: float) -> np.ndarray:
+    """Return F(x) = F0(x) + (1 - F0(s_c)) (x / s_c)^gamma for x < s_c, and 1 above.
+
+    Parameters
+    ----------
+    feed : Feed
+        The feed, F0.
+    size, critical : array_like
+        x and s_c in m, broadcast against each other; s_c = inf leaves the feed as it is.
+    gamma : float
+        Fragment exponent.
+    """
+    size, critical = np.broadcast_arrays(np.asarray(size, dtype=float), np.asarray(critical, dtype=float))
+    crushed = (1 - feeds.passing(feed, critical)) * (size / critical) ** gamma  # 0 where s_c is inf
+    return np.where(size < critical, feeds.passing(feed, size) + crushed, 1.0)
+
+
+def percentile(passing, fraction: float, coarsest: float, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the sizes in m, of the given shape, at which the rising function `passing` reaches `fraction`."""
+    low, high = np.full(shape, np.log(_FINEST)), np.full(shape, np.log(coarsest))
+    for _ in range(60):  # halves 70 nepers to rounding
+        middle = (low + high) / 2
+        above = passing(np.exp(middle)) >= fraction
+        low, high = np.where(above, low, middle), np.where(above, middle, high)
+    return np.exp(high)
+
+
+def expected_breaks(feed: Feed, critical, gamma: float) -> np.ndarray:
+    """Return the mean number of breaks per grain, the mean of 1 + gamma ln(s0 / s_c) over s0 >= s_c.
+
+    Integrated by parts: (1 - F0(s_c)) + gamma int_{s_c} (1 - F0(s)) d ln s.
+    """
+    critical = np.asarray(critical, dtype=float)
+    start = np.log(np.minimum(critical, feed.coarsest))
+    nodes, weights = np.polynomial.legendre.leggauss(200)
+    length = np.log(feed.coarsest) - start
+    size = np.exp(start[..., None] + length[..., None] * (nodes + 1) / 2)
+    tail = (1 - feeds.passing(feed, size)) @ (weights / 2) * length
+    reached = critical <= feed.coarsest
+    return np.where(reached, 1 - feeds.passing(feed, np.minimum(critical, feed.coarsest)) + gamma * tail, 0.0)

@@ -1,0 +1,191 @@
+"""Size distributions, percentiles, throughput, pressure and reduction of a Dataset, as free functions.
+
+Each returns a DataArray with a `streamline` dimension, or, with `total=True`, the figure of the whole gap.
+All stream tubes carry equal mass, so the whole gap is their plain mean (model page, section 4).
+"""
+
+import numpy as np
+import xarray as xr
+
+from hpgr import feed
+from hpgr.scene import Scene
+
+
+def passing(dataset: xr.Dataset, sieves=None, point: int = -1, total: bool = False) -> xr.DataArray:
+    """Return the mass fraction passing `sieves` at a material point, photographs pooled.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        From `hpgr.simulate` or a study.
+    sieves : array_like, optional
+        Sizes in m; default the recorded sieves. From recorded cells any size is exact; otherwise sizes
+        between sieves are interpolated linearly in log size.
+    point : int
+        Material point; the default is the exit. Others need recorded cells or distributions.
+    total : bool
+        Whether to combine the streamlines.
+
+    Returns
+    -------
+    xarray.DataArray
+        Dims (..., streamline, sieve), or (..., sieve) if `total`; 1.
+
+    Raises
+    ------
+    ValueError
+        If the Dataset holds no sizes, or none at that point, or a sieve is outside the recorded ones.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> dataset = hpgr.simulate(hpgr.presets.paper())
+    >>> float(hpgr.passing(dataset, [0.06], total=True)[0])
+    1.0
+    """
+    _require_sizes(dataset)
+    if "size" in dataset:
+        wanted = dataset["sieve"].values if sieves is None else np.atleast_1d(np.asarray(sieves, dtype=float))
+        rows = _pooled_cells(dataset, point)
+        counts = np.stack([np.searchsorted(row, wanted, side="right") for row in rows])
+        found = xr.DataArray(counts / rows.shape[1], dims=("streamline", "sieve"), coords={"sieve": wanted})
+    else:
+        found = _recorded_passing(dataset, point)
+        if sieves is not None:
+            found = _between_sieves(found, np.atleast_1d(np.asarray(sieves, dtype=float)))
+    found.attrs = {"units": "1", "long_name": "mass fraction passing"}
+    return found.mean("streamline", keep_attrs=True) if total else found
+
+
+def percentile_size(dataset: xr.Dataset, percent: float, point: int = -1, total: bool = False) -> xr.DataArray:
+    """Return the size in m that `percent` % of the mass passes at a material point, such as P80.
+
+    Exact from recorded cells, and for P50 and P80 of any product; other percentiles without cells are
+    interpolated between the recorded sieves, linearly in log size.
+
+    Raises
+    ------
+    ValueError
+        If `percent` is not within 0 to 100, or cannot be had from what was recorded.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> dataset = hpgr.simulate(hpgr.presets.paper())
+    >>> bool(hpgr.percentile_size(dataset, 80, total=True) == dataset["p80_total"])
+    True
+    """
+    _require_sizes(dataset)
+    if not 0 <= percent <= 100:
+        raise ValueError(f"percent: got {percent}; must be within 0 to 100; P80 is percent=80")
+    name = f"p{percent:g}" + ("_total" if total else "")
+    if _is_exit(dataset, point) and name in dataset:
+        return dataset[name]
+    if "size" in dataset:
+        rows = _pooled_cells(dataset, point)
+        found = np.quantile(rows, percent / 100, axis=None if total else 1)
+        result = xr.DataArray(found, dims=() if total else ("streamline",))
+    else:
+        result = _percentile_between_sieves(_recorded_passing(dataset, point), percent / 100, total)
+    result.attrs = {"units": "m", "long_name": f"size that {percent:g} % of the mass passes"}
+    return result
+
+
+def throughput(dataset: xr.Dataset, total: bool = False) -> xr.DataArray:
+    """Return the solids through each stream tube of both half gaps, or through the whole gap, kg/s.
+
+    Q = rho_s phi_exit s_b L U (model page, section 7), in equal parts.
+    """
+    if total:
+        return dataset["throughput"]
+    share = dataset["throughput"] / dataset.sizes["streamline"]
+    found = share * xr.ones_like(dataset["xi"])
+    found.attrs = dict(dataset["throughput"].attrs, long_name="solids through the stream tube and its mirror image")
+    return found
+
+
+def peak_pressure(dataset: xr.Dataset, total: bool = False) -> xr.Dataset:
+    """Return the largest mean stress (Pa) and its height above the minimum gap (m), as a Dataset.
+
+    Variables `peak_pressure` and `peak_pressure_height`, per streamline or of the whole bed.
+    """
+    names = ("peak_pressure", "peak_pressure_height")
+    return xr.Dataset({name: dataset[name if total else f"streamline_{name}"] for name in names})
+
+
+def reduction_ratio(dataset: xr.Dataset, percent: float = 80, total: bool = False) -> xr.DataArray:
+    """Return feed size over product size at `percent` % passing, such as F80/P80, 1.
+
+    The feed is that of `dataset.attrs["scene"]`, so the Dataset must come from `hpgr.simulate`.
+    """
+    scene = Scene.model_validate_json(dataset.attrs["scene"])
+    ratio = feed.quantile(scene.feed, percent / 100) / percentile_size(dataset, percent, total=total)
+    ratio.attrs = {"units": "1", "long_name": f"reduction ratio F{percent:g}/P{percent:g}"}
+    return ratio
+
+
+def gap_throughput(scene: Scene, exit_solid_fraction: float) -> float:
+    """Return the solids through the whole gap, Q = rho_s phi_exit s_b L U, kg/s."""
+    rolls = scene.rolls
+    surface_speed = rolls.speed * rolls.diameter / 2
+    return scene.material.solid_density * exit_solid_fraction * rolls.gap * rolls.width * surface_speed
+
+
+def _require_sizes(dataset: xr.Dataset) -> None:
+    if "passing" not in dataset:
+        raise ValueError("the Dataset holds no sizes: it is stress only (resolution.cells = 0); simulate it with cells")
+
+
+def _is_exit(dataset: xr.Dataset, point: int) -> bool:
+    return point in (-1, dataset.sizes.get("point", 0) - 1)
+
+
+def _pooled_cells(dataset: xr.Dataset, point: int) -> np.ndarray:
+    """Return the sizes at a point, (streamline, time x cell), sorted."""
+    sizes = dataset["size"].isel(point=point).transpose("streamline", "time", "cell").values
+    return np.sort(sizes.reshape(sizes.shape[0], -1), axis=1)
+
+
+def _recorded_passing(dataset: xr.Dataset, point: int) -> xr.DataArray:
+    if _is_exit(dataset, point):
+        return dataset["passing"]
+    if "mass_fraction" not in dataset:
+        raise ValueError(
+            f"point: got {point}; only the exit (-1) is recorded; "
+            "simulate with resolution.record 'distributions' or 'cells'"
+        )
+    return dataset["mass_fraction"].isel(point=point).mean("time").cumsum("sieve").assign_coords(sieve=dataset["sieve"])
+
+
+def _between_sieves(found: xr.DataArray, wanted: np.ndarray) -> xr.DataArray:
+    known = found["sieve"].values
+    outside = wanted[(wanted < known[0]) | (wanted > known[-1])]
+    if outside.size:
+        raise ValueError(
+            f"sieves: got {outside[0]:g} m; must lie within the recorded {known[0]:g} to {known[-1]:g} m; "
+            "extend resolution.sieves, or record 'cells'"
+        )
+
+    def interpolate(fractions):
+        return np.interp(np.log(wanted), np.log(known), fractions)
+
+    result = xr.apply_ufunc(
+        interpolate, found, input_core_dims=[["sieve"]], output_core_dims=[["wanted"]], vectorize=True
+    )
+    return result.rename(wanted="sieve").assign_coords(sieve=wanted)
+
+
+def _percentile_between_sieves(found: xr.DataArray, fraction: float, total: bool) -> xr.DataArray:
+    if total:
+        found = found.mean("streamline")
+    log_sieves = np.log(found["sieve"].values)
+
+    def invert(fractions):
+        if not fractions[0] <= fraction <= fractions[-1]:
+            raise ValueError(
+                f"percent: got {fraction:.0%}; the recorded sieves pass {fractions[0]:.3%} to {fractions[-1]:.3%}; "
+                "extend resolution.sieves, or record 'cells'"
+            )
+        return np.exp(np.interp(fraction, fractions, log_sieves))
+
+    return xr.apply_ufunc(invert, found, input_core_dims=[["sieve"]], vectorize=True)

@@ -1,0 +1,178 @@
+"""simulate(scene) -> Dataset: the one pipeline.
+
+Not simulate.py: importing a module of that name would replace the function `hpgr.simulate` by the module.
+"""
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from hpgr import __version__, budget, flow, geometry, metrics, schema, solve, stress
+from hpgr.scene import Scene
+
+_NIPPING = 1.5  # top size over gap above which rolls nip single grains, which is not modelled
+
+
+def simulate(scene: Scene, seed: int = 0, replicate: int = 0) -> xr.Dataset:
+    """Simulate the steady machine of `scene`.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is simulated; `scene.resolution.record` decides what is kept.
+    seed : int
+        Seed of all randomness, at least 0. The same scene and seed give the same bits.
+    replicate : int
+        Number of an independent repetition with the same seed, at least 0.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dims time (photographs of the steady machine), streamline (mid-plane to roll), point (entry to
+        exit), cell and sieve; SI units. `attrs["scene"]` rebuilds the scene with
+        `Scene.model_validate_json`; `flags` and `attrs["notes"]` tell which limits were hit.
+
+    Raises
+    ------
+    ValueError
+        If the seed or replicate is not a whole number of at least 0, or material points coincide.
+    MemoryError
+        If the scene does not fit this machine's memory; the message has the predicted bytes.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> scene = hpgr.presets.paper().with_values({"resolution.cells": 200, "resolution.points": 50})
+    >>> dataset = hpgr.simulate(scene)
+    >>> dict(dataset["size"].sizes)
+    {'time': 1, 'streamline': 10, 'point': 50, 'cell': 200}
+    """
+    for name, value in {"seed": seed, "replicate": replicate}.items():
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
+            raise ValueError(f"{name}: got {value!r}; must be a whole number of at least 0; such as {name}=0")
+    budget.refuse_too_large(scene)
+    points, substeps = scene.resolution.points, scene.stress.substeps
+    bed = geometry.bed(scene.rolls, scene.resolution.streamlines)
+    fine = flow.move(scene, bed, (points - 1) * substeps + 1)
+    state = stress.load(scene, fine)
+    crushing = stress.crushing_stress(scene, fine, state)
+    motion, state, crushing = (_every(substeps, part) for part in (fine, state, crushing))
+    crushed = solve.crush(scene, crushing, seed, replicate)
+    values = _fields(bed, motion, state) | _summaries(scene, motion, state) | _product(scene, crushed)
+    notes = _notes(scene, bed, state, crushed)
+    values["flags"] = sum(schema.FLAGS[name] for name in notes)
+    return schema.to_dataset(values, _attributes(scene, seed, replicate, bed, motion, notes))
+
+
+def _every(step: int, part: Any) -> Any:
+    """Return every step-th point of the (streamline, point) arrays within `part`."""
+    if isinstance(part, np.ndarray):
+        return part[..., ::step] if step > 1 else part
+    if step == 1:
+        return part
+    wanted = {name: value[..., ::step] for name, value in part._asdict().items() if np.ndim(value) == 2}
+    return part._replace(**wanted)
+
+
+def _fields(bed: geometry.Geometry, motion: flow.Motion, state: stress.Load) -> dict[str, Any]:
+    return {
+        "xi": bed.xi,
+        "x": motion.x,
+        "height": motion.y,
+        "residence_time": np.broadcast_to(motion.residence_time, motion.x.shape),
+        "speed": motion.speed,
+        "volumetric_strain_rate": motion.volumetric_rate,
+        "shear_strain_rate": motion.shear_rate,
+        "volumetric_strain": state.volumetric_strain,
+        "solid_fraction": state.solid_fraction,
+        "pressure": state.pressure,
+        "shear_stress": state.shear_stress,
+        "on_shear_limit": state.on_shear_limit,
+    }
+
+
+def _summaries(scene: Scene, motion: flow.Motion, state: stress.Load) -> dict[str, Any]:
+    pressure = state.pressure
+    peak = pressure.argmax(axis=1)
+    lines = np.arange(peak.size)
+    peaks, heights = pressure[lines, peak], motion.y[lines, peak]
+    highest = int(peaks.argmax())
+    return {
+        "throughput": metrics.gap_throughput(scene, float(state.solid_fraction[:, -1].mean())),
+        "peak_pressure": peaks[highest],
+        "peak_pressure_height": heights[highest],
+        "streamline_peak_pressure": peaks,
+        "streamline_peak_pressure_height": heights,
+        "continuity_solid_fraction": state.continuity_solid_fraction,
+        "shear_limit_fraction": state.on_shear_limit.mean(),
+    }
+
+
+def _product(scene: Scene, crushed: solve.Crushed | None) -> dict[str, Any]:
+    if crushed is None:
+        return {}
+    grid = scene.resolution
+    timed = crushed.size is not None or crushed.mass_fraction is not None
+    return {
+        "time": np.arange(grid.photographs) if timed else None,
+        "sieve": grid.sieves,
+        "size": crushed.size,
+        "mass_fraction": crushed.mass_fraction,
+        "passing": crushed.passing,
+        "passing_total": crushed.passing.mean(axis=0),
+        "p50": crushed.percentiles[0],
+        "p80": crushed.percentiles[1],
+        "p50_total": crushed.total_percentiles[0],
+        "p80_total": crushed.total_percentiles[1],
+        "breaks_per_cell": crushed.breaks,
+        "below_floor": crushed.below_floor,
+    }
+
+
+def _notes(scene: Scene, bed: geometry.Geometry, state: stress.Load, crushed: solve.Crushed | None) -> dict[str, str]:
+    """Return, by flag, a sentence for each limit that was hit."""
+    notes = {}
+    ore, rolls = scene.material, scene.rolls
+    needed = float(state.continuity_solid_fraction.max())
+    if bed.height == 0:
+        notes["no_compaction"] = "the gap equals the entry gap: nothing is compacted, the product is the feed"
+    if needed > ore.max_solid_fraction:
+        notes["solid_fraction_capped"] = (
+            f"mass continuity would need a solid fraction of {needed:.3g} at the exit; "
+            f"held at max_solid_fraction {ore.max_solid_fraction:g}"
+        )
+    if scene.feed.coarsest > _NIPPING * rolls.gap:
+        notes["single_particle_nipping"] = (
+            f"the feed's top size is {scene.feed.coarsest / rolls.gap:.3g} gaps; above {_NIPPING:g} the rolls nip "
+            "single grains, which is not modelled"
+        )
+    if state.tension_clamped:
+        notes["tension_clamped"] = "the elastic law asked for tension; the pressure was held at 0 there"
+    if crushed is None:
+        return notes
+    if not crushed.breaks.any():
+        notes["no_breakage"] = "no grain broke: the product is the feed"
+    if crushed.below_floor.any():
+        notes["size_floor_reached"] = (
+            f"{crushed.below_floor.mean():.3g} of the product is below the size floor, where nothing breaks"
+        )
+    if scene.resolution.cells in (2, 3):
+        notes["few_cells"] = "with 2 or 3 cells every cell neighbours every other; use more"
+    return notes
+
+
+def _attributes(scene, seed, replicate, bed, motion, notes) -> dict[str, Any]:
+    return {
+        "Conventions": "CF-1.11",
+        "title": "Comminution in high pressure grinding rolls, heterarchical model",
+        "source": f"hpgr {__version__}",
+        "history": f"hpgr {__version__}: simulate(scene, seed={seed}, replicate={replicate})",
+        "scene": scene.model_dump_json(),
+        "seed": int(seed),
+        "replicate": int(replicate),
+        "solver": solve.choose(scene),
+        "time_step_s": motion.time_step,
+        "streamline_deviation_m": bed.deviation(),
+        "notes": "\n".join(f"{name}: {text}" for name, text in notes.items()),
+    }

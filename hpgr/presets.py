@@ -1,0 +1,51 @@
+"""Ready scenes, data only; every figure has its source beside it."""
+
+from importlib.resources import files
+
+from hpgr.scene import Scene
+
+
+def paper() -> Scene:
+    """Return the machine and quartz feed of the paper (section 3), rolls 1 m wide.
+
+    The paper gives no roll width, so throughput is per metre of width. Material values are the defaults
+    of `hpgr.Material`, whose fields name their sources.
+    """
+    return Scene(
+        rolls=dict(
+            diameter=6.0,  # paper section 3
+            width=1.0,  # ours: the paper gives none
+            gap=0.06,  # paper section 3, s_b = 60 mm
+            entry_gap=1.14,  # paper section 3, s_t = 1140 mm
+            speed="19 rpm",  # paper section 3
+        ),
+        feed=dict(kind="uniform", bottom_size=0.008, top_size=0.06),  # paper section 3, 8 to 60 mm
+    )
+
+
+def khd_pilot() -> Scene:
+    """Return the KHD pilot rolls with porphyry, test P1 (Torres & Casali 2009). Uncalibrated.
+
+    Machine and feed are measured; strength and elasticity are still the paper's quartz, and the speed
+    profile its linear law. Pressure and fineness are therefore not predictions for this ore.
+
+    Source: Torres & Casali, "A novel approach for the modelling of high-pressure grinding rolls",
+    Minerals Engineering 22 (2009) 1137-1146, and the theses behind it.
+    """
+    return Scene(
+        rolls=dict(
+            diameter=0.80,  # Torres & Casali 2009
+            width=0.25,  # Torres & Casali 2009
+            gap=0.0190,  # test P1, working gap
+            entry_gap=0.163,  # ours: the entry angle of the paper's machine, 34.9 degrees
+            speed=0.67 / 0.40,  # test P1, peripheral speed 0.67 m/s
+        ),
+        material=dict(
+            solid_density=2740.0,  # Torres & Casali 2009, porphyry
+            feed_solid_fraction=0.595,  # bulk density 1.63 t/m3 over 2.74 t/m3
+        ),
+        feed=dict(kind="table", table=str(files("hpgr") / "data" / "khd_porphyry_feed.csv")),
+    )
+
+
+PRESETS = {"paper": paper, "khd_pilot": khd_pilot}

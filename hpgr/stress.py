@@ -1,0 +1,153 @@
+"""Granular elasticity of the bed: state functions, limits, and the march along a streamline (paper eq. 4).
+
+Compression is positive. The stresses derive from the energy
+psi = phi^3 eps_v^c [K eps_v^2 / ((c+1)(c+2)) + 3/2 G eps_s^2] at fixed solid fraction phi, of which eq. 4 is
+the Hessian when its eta is eps_s / eps_v; the paper's words have that ratio upside down.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from hpgr.flow import Motion
+from hpgr.scene import Material, Scene
+
+_TENSION_NOISE = 1e-9  # of the peak pressure; less is rounding of the running sum
+
+
+class Load(NamedTuple):
+    """State of the bed at the material points; arrays are (streamline, point).
+
+    Attributes
+    ----------
+    volumetric_strain : ndarray
+        Strain since the onset of compaction.
+    solid_fraction : ndarray
+        Solid fraction, at most the material's maximum.
+    pressure, shear_stress : ndarray
+        Mean stress p and triaxial shear stress q, Pa.
+    on_shear_limit : ndarray of bool
+        Whether shear beyond the convexity limit has been taken as plastic here.
+    continuity_solid_fraction : ndarray
+        (streamline,) solid fraction that mass continuity would need at the exit; may exceed 1.
+    tension_clamped : bool
+        Whether the law asked for tension somewhere and got zero pressure.
+    """
+
+    volumetric_strain: np.ndarray
+    solid_fraction: np.ndarray
+    pressure: np.ndarray
+    shear_stress: np.ndarray
+    on_shear_limit: np.ndarray
+    continuity_solid_fraction: np.ndarray
+    tension_clamped: bool
+
+
+def state_pressure(eps_v, eps_s, material: Material):
+    """Return p / phi^3 = K eps_v^(c+1)/(c+1) + 3/2 G c eps_v^(c-1) eps_s^2, Pa; 0 at eps_v = 0."""
+    c = material.elastic_exponent
+    eta = _ratio(eps_s, eps_v)
+    power = _power(eps_v, c + 1)
+    return power * (material.bulk_modulus / (c + 1) + 1.5 * material.shear_modulus * c * eta**2)
+
+
+def state_shear(eps_v, eps_s, material: Material):
+    """Return q / phi^3 = 3 G eps_v^c eps_s, Pa; 0 at eps_v = 0."""
+    c = material.elastic_exponent
+    return 3 * material.shear_modulus * _power(eps_v, c + 1) * _ratio(eps_s, eps_v)
+
+
+def largest_shear_ratio(material: Material) -> float:
+    """Return eta_max = sqrt(2 K / (3 G c (c+1))), where the energy stops being convex; inf for c <= 0."""
+    c = material.elastic_exponent
+    if c <= 0:
+        return math.inf
+    return math.sqrt(2 * material.bulk_modulus / (3 * material.shear_modulus * c * (c + 1)))
+
+
+def load(scene: Scene, motion: Motion) -> Load:
+    """Return stresses and strains at the material points of `motion`, marched from the onset of compaction.
+
+    `motion` holds `scene.stress.substeps` steps per time step; the result has its points.
+    """
+    material, step = scene.material, motion.time_step
+    compacting = np.cumsum(motion.volumetric_rate > 0, axis=1) > 0  # from the first compaction on
+    d_eps_v = _trapezoid(motion.volumetric_rate, compacting, step)
+    d_eps_s = _trapezoid(motion.shear_rate, compacting, step)
+    eps_v, _ = _sum_above_zero(d_eps_v)
+    eps_s, limited = _sum_below(d_eps_s, eps_v, largest_shear_ratio(material))
+    phi = np.minimum(material.feed_solid_fraction * np.exp(eps_v), material.max_solid_fraction)
+    if scene.stress.integrator == "increment":
+        stiffness = ((phi[:, 1:] + phi[:, :-1]) / 2) ** 3
+        d_p = stiffness * np.diff(state_pressure(eps_v, eps_s, material), axis=1)
+        d_q = stiffness * np.diff(state_shear(eps_v, eps_s, material), axis=1)
+    else:
+        d_p, d_q = _euler_increments(material, motion, compacting, eps_v, eps_s, phi)
+    pressure, tension = _sum_above_zero(d_p)
+    shear_stress, _ = _sum_above_zero(d_q)
+    return Load(
+        volumetric_strain=eps_v,
+        solid_fraction=phi,
+        pressure=pressure,
+        shear_stress=shear_stress,
+        on_shear_limit=limited,
+        continuity_solid_fraction=material.feed_solid_fraction * np.exp(eps_v[:, -1]),
+        tension_clamped=bool(tension > _TENSION_NOISE * pressure.max(initial=0.0)),
+    )
+
+
+def crushing_stress(scene: Scene, motion: Motion, state: Load) -> np.ndarray:
+    """Return the stress that crushes, Pa: zero where the bed does not compact (paper eq. 1, Heaviside)."""
+    stress = state.pressure
+    if scene.stress.crushing == "major":
+        stress = stress + 2 * state.shear_stress / 3
+    return np.where(motion.volumetric_rate > 0, stress, 0.0)
+
+
+def _euler_increments(material, motion, compacting, eps_v, eps_s, phi):
+    """Return the increments of p and q by eq. 4 with the rates and state at the start of each step."""
+    c, bulk, shear = material.elastic_exponent, material.bulk_modulus, material.shear_modulus
+    eta = _ratio(eps_s, eps_v)
+    scale = np.where(compacting, phi**3 * _power(eps_v, c), 0.0) * motion.time_step
+    rate_v, rate_s = motion.volumetric_rate, motion.shear_rate
+    d_p = scale * ((bulk + 1.5 * shear * c * (c - 1) * eta**2) * rate_v + 3 * shear * c * eta * rate_s)
+    d_q = scale * 3 * shear * (c * eta * rate_v + rate_s)
+    return d_p[:, :-1], d_q[:, :-1]
+
+
+def _trapezoid(rate, compacting, step):
+    """Return the increments (streamline, point - 1) of a rate between points past the onset."""
+    return np.where(compacting[:, :-1], (rate[:, 1:] + rate[:, :-1]) * (step / 2), 0.0)
+
+
+def _sum_above_zero(increments):
+    """Return the running sums from 0 that are held at zero when they would fall below, and by how much."""
+    total = np.cumsum(np.pad(increments, ((0, 0), (1, 0))), axis=1)
+    lowest = np.minimum.accumulate(total, axis=1)
+    return total - lowest, -float(lowest.min())
+
+
+def _sum_below(increments, eps_v, ratio):
+    """Return the running sums from 0 that are held at ratio * eps_v, and where they are held.
+
+    min(s + d, limit) at every step is D + running minimum of (limit - D), D the plain sum.
+    """
+    total = np.cumsum(np.pad(increments, ((0, 0), (1, 0))), axis=1)
+    if math.isinf(ratio):
+        return total, np.zeros(total.shape, dtype=bool)
+    room = ratio * eps_v - total
+    lowest = np.minimum.accumulate(np.minimum(room, 0.0), axis=1)
+    return np.maximum(total + lowest, 0.0), (room <= lowest) & (eps_v > 0)
+
+
+def _ratio(eps_s, eps_v):
+    """Return eta = eps_s / eps_v, 0 at eps_v = 0."""
+    return np.divide(eps_s, eps_v, out=np.zeros_like(np.asarray(eps_s, dtype=float)), where=np.asarray(eps_v) > 0)
+
+
+def _power(eps_v, exponent):
+    """Return eps_v ** exponent; at eps_v = 0 a negative exponent counts as 0, the bed being free of stress."""
+    eps_v = np.asarray(eps_v, dtype=float)
+    start = np.full_like(eps_v, 1.0 if exponent == 0 else 0.0)
+    return np.power(eps_v, exponent, out=start, where=eps_v > 0)
