@@ -45,6 +45,7 @@ def khd_pilot() -> Scene:
             feed_solid_fraction=0.595,  # bulk density 1.63 t/m3 over 2.74 t/m3
         ),
         feed=dict(kind="table", table=str(files("hpgr") / "data" / "khd_porphyry_feed.csv")),
+        note="uncalibrated: machine and feed are the KHD pilot's, strength and elasticity the paper's quartz",
     )
 
 

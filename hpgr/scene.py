@@ -21,8 +21,8 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
-    TypeAdapter,
     ValidationError,
+    create_model,
     model_validator,
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -143,10 +143,17 @@ class _Frozen(BaseModel):
                 known |= {f"{name}.{key}": value for key, value in field.annotation._known_values(raw).items()}
                 continue
             try:
-                known[name] = TypeAdapter(Annotated[field.annotation, field]).validate_python(raw)
+                known[name] = _valid_alone(field, raw)
             except ValidationError:
                 continue
         return known
+
+
+def _valid_alone(field: Any, value: Any) -> Any:
+    """Return `value` validated against one model field."""
+    strictness = ConfigDict(allow_inf_nan=False)
+    carrier = create_model("Alone", __config__=strictness, value=(field.annotation, field))
+    return carrier.model_validate({"value": value}).value
 
 
 def _values(model: BaseModel) -> dict[str, Any]:
@@ -547,6 +554,7 @@ class Scene(_Frozen):
     flow: Flow = Field(Flow(), description="How the bed moves")
     stress: Stress = Field(Stress(), description="How the bed is loaded")
     resolution: Resolution = Field(Resolution(), description="How finely, and what is kept")
+    note: str = Field("", description="What a reader of the results should know, such as what is not calibrated")
 
     @classmethod
     def _impossible(cls, known: dict[str, Any]) -> Iterator[Fault]:
@@ -603,10 +611,11 @@ class Scene(_Frozen):
         pydantic.ValidationError
             If a name is unknown, or the scene is impossible with these values.
         """
-        data = {name: dict(getattr(self, name)) for name in type(self).model_fields}
+        data: dict[str, Any] = {name: dict(part) for name, part in self if isinstance(part, BaseModel)}
         for name, value in values.items():
             section, _, key = name.partition(".")
             data.setdefault(section, {})[key] = value
+        data["note"] = self.note
         return type(self).model_validate(data)
 
     def __repr__(self) -> str:
@@ -619,6 +628,11 @@ class Scene(_Frozen):
         )
 
     __str__ = __repr__
+
+
+def faults_of(error: ValidationError, separator: str = "; ") -> str:
+    """Return the faults of a refused scene as text, each with its field."""
+    return separator.join(f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in error.errors())
 
 
 class FieldInfo(NamedTuple):
@@ -637,19 +651,42 @@ def field_info(name: str) -> FieldInfo:
     ValueError
         If a scene has no such field; the message lists the closest names.
     """
+    _, field = _find_field(name)
+    extra = field.json_schema_extra or {}
+    symbol = extra.get("symbol", name.rpartition(".")[2])
+    return FieldInfo(extra.get("unit", "1"), symbol, field.description.split(" (")[0].split(":")[0])
+
+
+def field_value(name: str, value: Any) -> Any:
+    """Return `value` as the scene field with this dotted name holds it: SI, checked against the field alone.
+
+    Examples
+    --------
+    >>> from hpgr.scene import field_value
+    >>> field_value("rolls.gap", "40 mm")
+    0.04
+
+    Raises
+    ------
+    ValueError
+        If a scene has no such field, or the field refuses the value.
+    """
+    part, field = _find_field(name)
+    try:
+        return _valid_alone(field, value)
+    except ValidationError as error:
+        fault = error.errors(include_url=False)[0] | {"loc": (name.rpartition(".")[2],)}
+        raise ValueError(f"{name}: {_explained(part, fault)['type'].message()}") from None
+
+
+def _find_field(name: str) -> tuple[type[_Frozen], Any]:
     fields = {
-        f"{section}.{key}": field
+        f"{section}.{key}": (part.annotation, field)
         for section, part in Scene.model_fields.items()
+        if issubclass(part.annotation, _Frozen)
         for key, field in part.annotation.model_fields.items()
     }
     if name not in fields:
-        close = difflib.get_close_matches(name, fields, n=3, cutoff=0.3)
-        raise ValueError(f"a scene has no field {name!r}; did you mean {' or '.join(map(repr, close)) or 'rolls.gap'}?")
-    extra = fields[name].json_schema_extra or {}
-    text = fields[name].description.split(" (")[0].split(";")[0]
-    return FieldInfo(extra.get("unit", "1"), extra.get("symbol", key_of(name)), text)
-
-
-def key_of(name: str) -> str:
-    """Return the last part of a dotted name."""
-    return name.rpartition(".")[2]
+        close = difflib.get_close_matches(name, fields, n=3, cutoff=0.3) or ["rolls.gap"]
+        raise ValueError(f"a scene has no field {name!r}; did you mean {' or '.join(map(repr, close))}?")
+    return fields[name]

@@ -1,0 +1,1 @@
+"""Parametric studies: scenes fanned out over dask, summaries in NetCDF, figures."""

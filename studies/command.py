@@ -1,0 +1,221 @@
+"""The command line that the sweeps over gap, speed and feed share."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import tyro
+from pydantic import ValidationError
+
+from hpgr import budget, presets, units
+from hpgr.scene import Scene, faults_of, field_info, field_value
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+AXES = {"gap": "rolls.gap", "roll_speed": "rolls.speed", "feed_top_size": "feed.top_size"}
+
+
+class Study(NamedTuple):
+    """One ready sweep: its name, the option of its main axis, default values as multiples, and its message."""
+
+    name: str
+    main: str
+    factors: tuple[float, ...]
+    about: str
+    caption: str
+
+
+def _shown_as(metavar: str):
+    return tyro.conf.arg(metavar=metavar)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of a sweep; quantities are text with a unit, such as "60 mm" or "19 rpm"."""
+
+    gap: Annotated[tuple[str, ...], _shown_as("LENGTH ...")] = ()
+    """Gaps to sweep, such as --gap "40 mm" "60 mm"."""
+    roll_speed: Annotated[tuple[str, ...], _shown_as("SPEED ...")] = ()
+    """Roll speeds to sweep, such as --roll-speed "15 rpm" "19 rpm"."""
+    feed_top_size: Annotated[tuple[str, ...], _shown_as("LENGTH ...")] = ()
+    """Top sizes of the feed to sweep, such as --feed-top-size "40 mm" "60 mm"."""
+    scene: Annotated[str, _shown_as("PRESET|FILE")] = "paper"
+    """Base scene: a preset (paper, khd_pilot), or the path of a .toml or .json scene file."""
+    replicates: Annotated[int, _shown_as("N")] = 3
+    """Independent repetitions of every operating point; they make the spread."""
+    cells: Annotated[int | None, _shown_as("N")] = None
+    """Cells per material point (default: the scene's); 0 computes stress only."""
+    points: Annotated[int | None, _shown_as("N")] = None
+    """Material points per streamline (default: the scene's)."""
+    streamlines: Annotated[int | None, _shown_as("N")] = None
+    """Streamlines from the mid-plane to the roll (default: the scene's)."""
+    sieve: Annotated[str, _shown_as("LENGTH")] = "1 mm"
+    """Sieve whose percent passing is shown."""
+    workers: Annotated[int, _shown_as("N")] = 2
+    """Threads of this process to run cases on; without effect beside --scheduler."""
+    scheduler: Annotated[str | None, _shown_as("ADDRESS")] = None
+    """Running dask scheduler to use instead, such as tcp://127.0.0.1:8786."""
+    seed: Annotated[int, _shown_as("N")] = 0
+    """Seed of all randomness; the same seed gives the same bits."""
+    out: Annotated[Path | None, _shown_as("FILE")] = None
+    """NetCDF file to write (default: outputs/<study>.nc); the figure goes beside it as .png."""
+    plot: bool = True
+    """Draw the figure, or not."""
+    dry_run: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """List the cases with their predicted memory and time, and run none."""
+
+
+def run(study: Study, arguments: Sequence[str] | None = None) -> int:
+    """Run a study from the command line; return its exit code.
+
+    0: every case is well. 1: some cases hold no result, named on standard error. 2: nothing was run.
+    """
+    options = tyro.cli(Options, prog=f"python -m studies.{study.name}", description=study.about, args=arguments)
+    try:
+        scene, axes = _base_scene(options), {}
+        axes = _axes(study, options, scene)
+        sieve = _sieve(options, scene)
+        if min(options.workers, options.replicates) < 1:
+            raise ValueError(
+                f"got --workers {options.workers} --replicates {options.replicates}; both must be at least 1"
+            )
+        if options.seed < 0:
+            raise ValueError(f"got --seed {options.seed}; must be at least 0")
+        if options.dry_run:
+            _print_cases(scene, axes, options)
+            return 0
+        result = _sweep(scene, axes, options)
+    except ValidationError as error:
+        return _refuse(f"the scene is refused:\n  {faults_of(error, separator='\n  ')}")
+    except (OSError, ValueError, MemoryError) as error:
+        return _refuse(str(error))
+    result.attrs["history"] = _command_line(study, arguments)
+    return _report(study, options, result, sieve)
+
+
+def _base_scene(options: Options) -> Scene:
+    if options.scene in presets.PRESETS:
+        scene = presets.PRESETS[options.scene]()
+    elif Path(options.scene).suffix in {".toml", ".json"}:
+        scene = Scene.from_file(options.scene)
+    else:
+        raise ValueError(
+            f"--scene: got {options.scene!r}; must be a preset ({', '.join(presets.PRESETS)}) or a .toml or .json file"
+        )
+    given = {f"resolution.{name}": getattr(options, name) for name in ("cells", "points", "streamlines")}
+    return scene.with_values({name: value for name, value in given.items() if value is not None})
+
+
+def _axes(study: Study, options: Options, scene: Scene) -> dict[str, list]:
+    """Return the swept fields with their values, the study's own first."""
+    order = [study.main, *(name for name in AXES if name != study.main)]
+    axes = {AXES[name]: list(getattr(options, name)) for name in order if getattr(options, name)}
+    if not getattr(options, study.main):
+        axes = {AXES[study.main]: _default_values(study, scene), **axes}
+    from studies.sweep import axis_values  # late, like all that --help does without
+
+    return axis_values(axes)
+
+
+def _default_values(study: Study, scene: Scene) -> list[float]:
+    """Return the scene's own value times the study's factors."""
+    section, key = AXES[study.main].split(".")
+    own = getattr(getattr(scene, section), key)
+    if own is None and key == "top_size":
+        own = scene.feed.coarsest
+    return [float(f"{own * factor:.3g}") for factor in study.factors]
+
+
+def _sieve(options: Options, scene: Scene) -> float:
+    sieve, known = field_value("rolls.gap", options.sieve), scene.resolution.sieves
+    if not known[0] <= sieve <= known[-1]:
+        raise ValueError(
+            f"--sieve: got {options.sieve!r}; must lie within the scene's sieves, "
+            f"{units.show(known[0], 'm')} to {units.show(known[-1], 'm')}"
+        )
+    return sieve
+
+
+def _sweep(scene: Scene, axes: dict[str, list], options: Options) -> "xr.Dataset":
+    from studies.sweep import sweep
+
+    common = {"replicates": options.replicates, "seed": options.seed, "progress": True}
+    if options.scheduler is None:
+        return sweep(scene, axes, threads=options.workers, **common)
+    from distributed import Client
+
+    with Client(options.scheduler, timeout="10s") as client:
+        return sweep(scene, axes, client=client, **common)
+
+
+def _print_cases(scene: Scene, axes: dict[str, list], options: Options) -> None:
+    from studies.sweep import enumerate_cases
+
+    print(f"{scene}\n")
+    names = list(axes)
+    print("".join(f"{_heading(name):>24}" for name in names) + f"{'memory':>12}{'time':>12}")
+    total = 0.0
+    for case in enumerate_cases(axes, 1):
+        shown = "".join(f"{units.show(case.values[name], field_info(name).unit):>24}" for name in names)
+        try:
+            cost = budget.predict(scene.with_values({**case.values, "resolution.record": "product"}))
+        except ValidationError as error:
+            print(f"{shown}  refused: {faults_of(error)}")
+            continue
+        total += cost.seconds * options.replicates
+        print(f"{shown}{cost.bytes / 1e6:>9.1f} MB{cost.seconds * 1e3:>9.1f} ms")
+    count = options.replicates * sum(1 for _ in enumerate_cases(axes, 1))
+    print(f"\n{count} cases ({options.replicates} replicates each), about {total / options.workers:.2g} s on "
+          f"{options.workers} threads, plus start-up")  # fmt: skip
+
+
+def _report(study: Study, options: Options, result: "xr.Dataset", sieve: float) -> int:
+    """Write the files, print the table, and return the exit code."""
+    from studies import report, store
+
+    out = options.out or Path("outputs") / f"{study.name}.nc"
+    if out.suffix != ".nc":
+        out = out.with_name(out.name + ".nc")
+    try:
+        store.write_dataset(result, out)
+        written = [out]
+        if options.plot and report.any_result(result):
+            from studies import plots
+
+            figure = plots.sweep_figure(result, AXES[study.main], sieve, study.caption)
+            store.replace(out.with_suffix(".png"), lambda part: figure.savefig(part, dpi=150))
+            written.append(out.with_suffix(".png"))
+    except OSError as error:
+        return _refuse(f"could not write the result: {error}")
+    print(report.table(result, sieve))
+    for line in (*report.notes(result), study.caption):
+        print(line)
+    print("wrote " + " and ".join(map(str, written)))
+    lost = report.lost_cases(result)
+    for line in lost:
+        print(line, file=sys.stderr)
+    return 1 if lost else 0
+
+
+def _heading(name: str) -> str:
+    info = field_info(name)
+    shown = units.SHOWN.get(info.unit, (info.unit,))[0]
+    return f"{AXES_BY_FIELD.get(name, name)} [{shown}]"
+
+
+AXES_BY_FIELD = {field: name.replace("_", " ") for name, field in AXES.items()}
+
+
+def _command_line(study: Study, arguments: Sequence[str] | None) -> str:
+    import shlex
+
+    given = sys.argv[1:] if arguments is None else arguments
+    return f"python -m studies.{study.name} {shlex.join(given)}".strip()
+
+
+def _refuse(message: str) -> int:
+    print(f"error: {message}", file=sys.stderr)
+    return 2

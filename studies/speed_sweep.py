@@ -1,0 +1,29 @@
+"""Roll speed against throughput, fineness and pressure: `python -m studies.speed_sweep`."""
+
+from collections.abc import Sequence
+
+from studies.command import Study, run
+
+STUDY = Study(
+    name="speed_sweep",
+    main="roll_speed",
+    factors=(0.5, 0.75, 1.0, 1.25, 1.5, 2.0),
+    about=(
+        "Sweep the roll speed, and further axes if given, and write throughput, fineness and pressure of every "
+        "operating point to outputs/speed_sweep.nc and .png. Default: 0.5 to 2 times the scene's speed. Without "
+        "exchange between streamlines the model knows no rate: speed changes throughput and nothing else."
+    ),
+    caption=(
+        "Without exchange between streamlines, speed changes throughput and nothing else: crushing and elasticity "
+        "(paper eqs. 1, 2, 4) know no rate."
+    ),
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the study and return its exit code; `arguments` default to the command line's."""
+    return run(STUDY, arguments)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,69 @@
+"""The only writer of files: NetCDF summaries and figures, whole or not at all."""
+
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+
+def write_dataset(dataset: xr.Dataset, path: str | Path) -> None:
+    """Write `dataset` as compressed, checksummed NetCDF; the file at `path` is replaced whole or not at all.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; a file that stood at `path` before is left as it was.
+    """
+    encoding = {name: _encoding(variable) for name, variable in dataset.variables.items()}
+    replace(path, lambda part: dataset.to_netcdf(part, engine="netcdf4", format="NETCDF4", encoding=encoding))
+
+
+def replace(path: str | Path, write: Callable[[Path], object]) -> None:
+    """Let `write` make a file under a temporary name, then put it in the place of `path`.
+
+    Raises
+    ------
+    OSError
+        If the folder or the file cannot be written; nothing is left behind.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    part = Path(name)
+    try:
+        write(part)
+        _sync(part)
+        part.chmod(0o666 & ~_umask())  # mkstemp makes private files; a result is for colleagues too
+        os.replace(part, path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+    _sync(path.parent)
+
+
+def _encoding(variable: xr.Variable) -> dict:
+    # None: no value of ours means "missing"; NaN does, and is one already
+    encoding = {"_FillValue": None} if variable.dtype.kind in "fiu" else {}
+    if variable.ndim and variable.dtype.kind in "fiu":
+        encoding |= {"zlib": True, "complevel": 1, "shuffle": True, "fletcher32": True}
+    if variable.dtype == np.float64 and variable.ndim > 1:
+        encoding["dtype"] = "float32"
+    return encoding
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
