@@ -89,7 +89,7 @@ def run(study: Study, arguments: Sequence[str] | None = None) -> int:
             return 0
         result = _sweep(scene, axes, options)
     except ValidationError as error:
-        return _refuse(f"the scene is refused:\n  {faults_of(error, separator='\n  ')}")
+        return _refuse("the scene is refused:\n  " + faults_of(error, separator="\n  "))
     except (OSError, ValueError, MemoryError) as error:
         return _refuse(str(error))
     result.attrs["history"] = _command_line(study, arguments)
