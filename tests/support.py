@@ -1,0 +1,86 @@
+"""What several test files share: scenes of small size, lines of cells, and one call of the crushing kernel."""
+
+import math
+
+import numba
+import numpy as np
+from hpgr import kernels, presets
+
+COMPILED = not numba.config.DISABLE_JIT
+
+# A Kolmogorov-Smirnov distance above KS / sqrt(samples) happens by chance once in a million tests:
+# 2 exp(-2 KS^2) = 1e-6 (the exact probability is smaller for finite samples).
+KS = math.sqrt(math.log(2e6) / 2)
+SIGMAS = 5  # a normal deviate leaves +-5 sigma once in 1.7 million tests
+
+
+def sized(full, reduced):
+    """Return `full`, or `reduced` where the kernels run as plain Python."""
+    return full if COMPILED else reduced
+
+
+def plain(function):
+    """Return the Python function behind a compiled one, whose globals can be monkeypatched."""
+    return getattr(function, "py_func", function)
+
+
+def paper(values=None):
+    """Return the paper's scene in a small resolution, with other values by dotted name."""
+    small = {"resolution.streamlines": 3, "resolution.points": 61, "resolution.cells": 64}
+    return presets.paper().with_values(small | (values or {}))
+
+
+def feed_values(**fields):
+    """Return values for `with_values` that replace the paper's uniform feed."""
+    names = ("kind", "bottom_size", "top_size", "size", "exponent", "table")
+    return {f"feed.{name}": fields.get(name) for name in names}
+
+
+def line(cells, seed=0, low=0.008, high=0.06):
+    """Return sizes and streams of a line of cells, sizes uniform in the log."""
+    generator = np.random.default_rng(seed)
+    sizes = np.exp(generator.uniform(np.log(low), np.log(high), cells)).astype(np.float32)
+    return sizes, streams(cells, seed)
+
+
+def streams(cells, seed=0):
+    found = np.empty(cells, np.uint64)
+    kernels.start_streams(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0], found)
+    return found
+
+
+def march(
+    sizes, streams, log_stress, w=3.04, n=1.0, gamma=1.0, strength_size=0.06, floor=1e-6, sieves=(), every=False,
+    kernel=kernels.march,
+):  # fmt: skip
+    """March copies of a line through a stress history.
+
+    Returns
+    -------
+    (sizes, streams, breaks), and with `every` also (sizes, classes) after every step.
+    """
+    sizes, streams, log_stress = sizes.copy(), streams.copy(), np.asarray(log_stress, float)
+    sieves = np.asarray(sieves, float)
+    slope = 3 / w
+    with np.errstate(over="ignore"):
+        reach_needed = np.exp(-log_stress / (slope or 1.0))
+    snapshots = np.empty((log_stress.size, sizes.size) if every else (0, 0), np.float32)
+    classes = np.empty((log_stress.size, sieves.size + 1) if every and sieves.size else (0, 0), np.int64)
+    breaks = kernel(
+        sizes, streams, log_stress, reach_needed, sieves, snapshots, classes,
+        slope, 1 / (2 * n * n), 1 / gamma, strength_size, floor,
+    )  # fmt: skip
+    return (sizes, streams, breaks, snapshots, classes) if every else (sizes, streams, breaks)
+
+
+def critical_log_stress(critical, w=3.04, strength_size=0.06):
+    """Return log(sigma_a / sigma_m) at which grains of size `critical` just break without cushioning."""
+    return -(3 / w) * math.log(critical / strength_size)
+
+
+def ks_distance(sample, distribution):
+    """Return the largest distance between the sample's and a continuous distribution function."""
+    ordered = np.sort(np.asarray(sample, float))
+    exact = distribution(ordered)
+    count = np.arange(ordered.size + 1) / ordered.size
+    return max(np.max(count[1:] - exact), np.max(exact - count[:-1]))
