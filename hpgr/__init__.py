@@ -16,6 +16,7 @@ _HOMES = {
     "Feed": "scene",
     "Flow": "scene",
     "Stress": "scene",
+    "Exchange": "scene",
     "Resolution": "scene",
     "simulate": "pipeline",
     "passing": "metrics",

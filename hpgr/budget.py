@@ -36,6 +36,11 @@ def predict(scene: Scene) -> Cost:
         product = 4 * grid.photographs * lines * cells
         size += 3 * product + 40 * cells  # kept, pooled, sorted; and the work space of one line
         seconds += grid.photographs * lines * cells * (0.28e-6 + 0.15e-9 * points)
+        if scene.exchange is not None:
+            parcels = lines * points * cells
+            size += 17 * parcels + 30_000 * lines * points  # sizes, streams, bounds; edges of the tessellation
+            steps = points + grid.photographs * scene.exchange.interval
+            seconds += 5e-5 * lines * points + steps * lines * points * (2e-6 + 1.5e-9 * cells)
         if grid.record == "cells":
             size += product * points
             seconds += 1e-9 * product * points / 4

@@ -12,7 +12,7 @@ from hpgr.scene import Scene
 
 
 def passing(dataset: xr.Dataset, sieves=None, point: int = -1, total: bool = False) -> xr.DataArray:
-    """Return the mass fraction passing `sieves` at a material point, photographs pooled.
+    """Return the mass fraction passing `sieves` at a material point, photographs of the steady machine pooled.
 
     Parameters
     ----------
@@ -136,13 +136,20 @@ def _require_sizes(dataset: xr.Dataset) -> None:
         raise ValueError("the Dataset holds no sizes: it is stress only (resolution.cells = 0); simulate it with cells")
 
 
+def _steady(recorded: xr.DataArray) -> xr.DataArray:
+    """Return the photographs that are not of the start-up."""
+    if "steady" not in recorded.coords:
+        return recorded
+    return recorded.isel(time=np.flatnonzero(recorded["steady"].values))
+
+
 def _is_exit(dataset: xr.Dataset, point: int) -> bool:
     return point in (-1, dataset.sizes.get("point", 0) - 1)
 
 
 def _pooled_cells(dataset: xr.Dataset, point: int) -> np.ndarray:
     """Return the sizes at a point, (streamline, time x cell), sorted."""
-    sizes = dataset["size"].isel(point=point).transpose("streamline", "time", "cell").values
+    sizes = _steady(dataset["size"]).isel(point=point).transpose("streamline", "time", "cell").values
     return np.sort(sizes.reshape(sizes.shape[0], -1), axis=1)
 
 
@@ -154,7 +161,13 @@ def _recorded_passing(dataset: xr.Dataset, point: int) -> xr.DataArray:
             f"point: got {point}; only the exit (-1) is recorded; "
             "simulate with resolution.record 'distributions' or 'cells'"
         )
-    return dataset["mass_fraction"].isel(point=point).mean("time").cumsum("sieve").assign_coords(sieve=dataset["sieve"])
+    return (
+        _steady(dataset["mass_fraction"])
+        .isel(point=point)
+        .mean("time")
+        .cumsum("sieve")
+        .assign_coords(sieve=dataset["sieve"])
+    )
 
 
 def _between_sieves(found: xr.DataArray, wanted: np.ndarray) -> xr.DataArray:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from hpgr import __version__, budget, flow, geometry, metrics, schema, solve, stress
+from hpgr import __version__, budget, exchange, flow, geometry, metrics, schema, solve, stress, tessellation
 from hpgr.scene import Scene
 
 _NIPPING = 1.5  # top size over gap above which rolls nip single grains, which is not modelled
@@ -58,8 +58,13 @@ def simulate(scene: Scene, seed: int = 0, replicate: int = 0) -> xr.Dataset:
     state = stress.load(scene, fine)
     crushing = stress.crushing_stress(scene, fine, state)
     motion, state, crushing = (_every(substeps, part) for part in (fine, state, crushing))
-    crushed = solve.crush(scene, crushing, seed, replicate)
+    cells = rates = None
+    if solve.choose(scene) == "lattice":
+        cells = tessellation.tessellate(scene, bed, motion)
+        rates = exchange.swap_rates(scene, motion, state, cells)
+    crushed = solve.crush(scene, crushing, motion.time_step, rates, seed, replicate)
     values = _fields(bed, motion, state) | _summaries(scene, motion, state) | _product(scene, crushed)
+    values["volume"] = None if cells is None else cells.volume
     notes = _notes(scene, bed, state, crushed)
     values["flags"] = sum(schema.FLAGS[name] for name in notes)
     return schema.to_dataset(values, _attributes(scene, seed, replicate, bed, motion, notes))
@@ -112,11 +117,10 @@ def _summaries(scene: Scene, motion: flow.Motion, state: stress.Load) -> dict[st
 def _product(scene: Scene, crushed: solve.Crushed | None) -> dict[str, Any]:
     if crushed is None:
         return {}
-    grid = scene.resolution
-    timed = crushed.size is not None or crushed.mass_fraction is not None
-    return {
-        "time": np.arange(grid.photographs) if timed else None,
-        "sieve": grid.sieves,
+    frames = next((part.shape[0] for part in (crushed.size, crushed.mass_fraction) if part is not None), None)
+    values = {
+        "time": None if frames is None else np.arange(frames),
+        "sieve": scene.resolution.sieves,
         "size": crushed.size,
         "mass_fraction": crushed.mass_fraction,
         "passing": crushed.passing,
@@ -128,6 +132,12 @@ def _product(scene: Scene, crushed: solve.Crushed | None) -> dict[str, Any]:
         "breaks_per_cell": crushed.breaks,
         "below_floor": crushed.below_floor,
     }
+    exchanged = crushed.exchanged
+    if exchanged is not None:
+        values |= {"swaps_per_cell": exchanged.swaps_per_cell, "exchange_passes": exchanged.passes}
+        if frames is not None:
+            values |= {"elapsed_time": exchanged.elapsed_time, "steady": exchanged.steady}
+    return values
 
 
 def _notes(scene: Scene, bed: geometry.Geometry, state: stress.Load, crushed: solve.Crushed | None) -> dict[str, str]:

@@ -14,7 +14,7 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self, get_args
 
 from pydantic import (
     BaseModel,
@@ -139,8 +139,10 @@ class _Frozen(BaseModel):
         known: dict[str, Any] = {}
         for name, field in cls.model_fields.items():
             raw = data.get(name, field.default) if isinstance(data, Mapping) else None
-            if isinstance(field.annotation, type) and issubclass(field.annotation, _Frozen):
-                known |= {f"{name}.{key}": value for key, value in field.annotation._known_values(raw).items()}
+            part = _part(field)
+            if part is not None:
+                if raw is not None:
+                    known |= {f"{name}.{key}": value for key, value in part._known_values(raw).items()}
                 continue
             try:
                 known[name] = _valid_alone(field, raw)
@@ -154,6 +156,14 @@ def _valid_alone(field: Any, value: Any) -> Any:
     strictness = ConfigDict(allow_inf_nan=False)
     carrier = create_model("Alone", __config__=strictness, value=(field.annotation, field))
     return carrier.model_validate({"value": value}).value
+
+
+def _part(field: Any) -> type["_Frozen"] | None:
+    """Return the model that a field holds, be it optional, or None if it holds a plain value."""
+    for kind in (field.annotation, *get_args(field.annotation)):
+        if isinstance(kind, type) and issubclass(kind, _Frozen):
+            return kind
+    return None
 
 
 def _values(model: BaseModel) -> dict[str, Any]:
@@ -480,6 +490,29 @@ class Stress(_Frozen):
     )
 
 
+class Exchange(_Frozen):
+    """Segregation and mixing between neighbouring material points, by swaps of cells (paper eq. 3; closure ours)."""
+
+    segregation: Number = _field(
+        "A", "1", "Percolation velocity over shear rate and size difference: large grains rise, small ones sink",
+        "ours", "give A, such as 0.1, or 0", 0.1, ge=0, le=100,
+    )  # fmt: skip
+    mixing: Number = _field(
+        "B", "1", "Shear-induced self-diffusion over shear rate and mean size squared", "ours",
+        "give B, such as 0.1, or 0", 0.1, ge=0, le=100,
+    )  # fmt: skip
+    fill: Literal["feed", "crushed"] = Field(
+        "feed",
+        description="What the machine is filled with at the start: 'feed', or the bed as 'crushed' without exchange",
+    )
+    interval: Count = _field(
+        "n_s", "1", "Time steps between photographs", "ours", "give a whole number such as 20", 20, ge=1, le=1_000_000
+    )
+    record_startup: bool = Field(
+        False, description="Whether photographs of the start-up, from the first fill on, come before the steady ones"
+    )
+
+
 def _default_sieves() -> tuple[float, ...]:
     """Return 1 um to 1 m in the R10 series (ten sieves a decade, ISO 3)."""
     return tuple(float(f"{10 ** (k / 10 - 6):.6g}") for k in range(61))
@@ -553,6 +586,7 @@ class Scene(_Frozen):
     material: Material = Field(Material(), description="The ore and its bed; default: the paper's quartz")
     flow: Flow = Field(Flow(), description="How the bed moves")
     stress: Stress = Field(Stress(), description="How the bed is loaded")
+    exchange: Exchange | None = Field(None, description="Segregation and mixing; None switches both off")
     resolution: Resolution = Field(Resolution(), description="How finely, and what is kept")
     note: str = Field("", description="What a reader of the results should know, such as what is not calibrated")
 
@@ -611,11 +645,10 @@ class Scene(_Frozen):
         pydantic.ValidationError
             If a name is unknown, or the scene is impossible with these values.
         """
-        data: dict[str, Any] = {name: dict(part) for name, part in self if isinstance(part, BaseModel)}
+        data: dict[str, Any] = {name: dict(part) if isinstance(part, BaseModel) else part for name, part in self}
         for name, value in values.items():
             section, _, key = name.partition(".")
-            data.setdefault(section, {})[key] = value
-        data["note"] = self.note
+            data[section] = (data.get(section) or {}) | {key: value}
         return type(self).model_validate(data)
 
     def __repr__(self) -> str:
@@ -681,10 +714,10 @@ def field_value(name: str, value: Any) -> Any:
 
 def _find_field(name: str) -> tuple[type[_Frozen], Any]:
     fields = {
-        f"{section}.{key}": (part.annotation, field)
-        for section, part in Scene.model_fields.items()
-        if issubclass(part.annotation, _Frozen)
-        for key, field in part.annotation.model_fields.items()
+        f"{section}.{key}": (part, field)
+        for section, part in ((name, _part(field)) for name, field in Scene.model_fields.items())
+        if part is not None
+        for key, field in part.model_fields.items()
     }
     if name not in fields:
         close = difflib.get_close_matches(name, fields, n=3, cutoff=0.3) or ["rolls.gap"]

@@ -18,7 +18,7 @@ class Variable(NamedTuple):
 _POINT = ("streamline", "point")
 
 COORDINATES = {
-    "time": Variable(("time",), "1", "number of the photograph of the steady machine", np.int32),
+    "time": Variable(("time",), "1", "number of the photograph", np.int32),
     "xi": Variable(
         ("streamline",), "1", "distance from the mid-plane over that of the outermost streamline", np.float64
     ),
@@ -58,6 +58,9 @@ VARIABLES = {
     "p80_total": Variable((), "m", "product size that 80 % of the mass passes, whole gap"),
     "breaks_per_cell": Variable(("streamline",), "1", "mean number of breaks of a cell"),
     "below_floor": Variable(("streamline",), "1", "fraction of the product below the size floor, where nothing breaks"),
+    "volume": Variable(_POINT, "m2", "area of the Voronoi cell of the material point, volume per roll width"),
+    "swaps_per_cell": Variable((), "1", "mean number of swaps of a cell in one residence time"),
+    "exchange_passes": Variable((), "1", "most passes a time step of exchange was split into", np.int32),
     "flags": Variable((), "1", "limits that were hit", np.int32),
 }
 

@@ -1,16 +1,39 @@
-"""Picks the cheapest solver the scene allows, casts once, and calls the kernels (model page, section 6)."""
+"""Picks the cheapest solver the scene allows, runs it, and sums up the product (docs/model.md, Solvers)."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from hpgr import feed, kernels, limits
+from hpgr import kernels, limits, parcels
+from hpgr.exchange import SwapRates
+from hpgr.lattice import Lattice
 from hpgr.scene import Scene
 
 _NO_SIEVES = np.empty(0)
 _NO_SNAPSHOTS = np.empty((0, 0), np.float32)
 _NO_CLASSES = np.empty((0, 0), np.int64)
+
+
+class Exchanged(NamedTuple):
+    """What only the lattice knows.
+
+    Attributes
+    ----------
+    elapsed_time : ndarray
+        (time,) time of each photograph since the first fill, s.
+    steady : ndarray of bool
+        (time,) whether it was taken after one residence time; the product is that of these photographs.
+    passes : int
+        Most passes a time step was split into to keep the swap probabilities of a cell at 1/2.
+    swaps_per_cell : float
+        Mean number of swaps a cell takes part in during one residence time.
+    """
+
+    elapsed_time: np.ndarray
+    steady: np.ndarray
+    passes: int
+    swaps_per_cell: float
 
 
 class Crushed(NamedTuple):
@@ -30,6 +53,8 @@ class Crushed(NamedTuple):
         (time, streamline, point, cell) float32, m.
     mass_fraction : ndarray
         (time, streamline, point, sieve) mass fraction between each sieve and the next finer one.
+    exchanged : Exchanged
+        What only a scene with exchange has.
     """
 
     breaks: np.ndarray
@@ -39,23 +64,42 @@ class Crushed(NamedTuple):
     total_percentiles: np.ndarray
     size: np.ndarray | None = None
     mass_fraction: np.ndarray | None = None
+    exchanged: Exchanged | None = None
 
 
 FRACTIONS = (0.5, 0.8)  # of the percentiles every product is summarised by
 
 
 def choose(scene: Scene) -> str:
-    """Return the name of the cheapest solver: "stress only", "closed form" or "march"."""
+    """Return the name of the cheapest solver: "stress only", "closed form", "march" or "lattice"."""
     if scene.resolution.cells == 0:
         return "stress only"
+    if scene.exchange is not None and scene.rolls.gap < scene.rolls.entry_gap:  # equal gaps: nothing moves or mixes
+        return "lattice"
     ore = scene.material
     if math.isinf(ore.cushioning) and not math.isinf(ore.weibull_modulus) and scene.resolution.record != "cells":
         return "closed form"
     return "march"
 
 
-def crush(scene: Scene, stress: np.ndarray, seed: int, replicate: int) -> Crushed | None:
-    """Crush the feed of `scene` under `stress` (streamline, point), Pa; None for a stress-only scene."""
+def crush(
+    scene: Scene, stress: np.ndarray, time_step: float, rates: SwapRates | None, seed: int, replicate: int
+) -> Crushed | None:
+    """Crush the feed of `scene`; None for a stress-only scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is simulated.
+    stress : ndarray
+        (streamline, point) stress that crushes, Pa.
+    time_step : float
+        Time between points, s.
+    rates : SwapRates, optional
+        Swap rates per time step; the lattice needs them.
+    seed, replicate : int
+        Keys of the randomness.
+    """
     solver = choose(scene)
     if solver == "stress only":
         return None
@@ -63,6 +107,8 @@ def crush(scene: Scene, stress: np.ndarray, seed: int, replicate: int) -> Crushe
         log_stress = np.log(stress / scene.material.strength)
     if solver == "closed form":
         return _closed_form(scene, log_stress)
+    if solver == "lattice":
+        return _run_lattice(scene, log_stress, time_step, rates, seed, replicate)
     return _march(scene, log_stress, seed, replicate)
 
 
@@ -94,49 +140,76 @@ def _closed_form(scene: Scene, log_stress: np.ndarray) -> Crushed:
 
 def _march(scene: Scene, log_stress: np.ndarray, seed: int, replicate: int) -> Crushed:
     """March one parcel per streamline and photograph; each is keyed, so their order does not matter."""
-    ore, grid = scene.material, scene.resolution
+    grid = scene.resolution
     shape = (grid.photographs, *log_stress.shape)
     product = np.empty((*shape[:2], grid.cells), np.float32)
     size = np.empty((*shape, grid.cells), np.float32) if grid.record == "cells" else None
     sieves = np.array(grid.sieves) if grid.record == "distributions" else _NO_SIEVES
     classes = np.empty((*shape, sieves.size + 1), np.int64) if sieves.size else None
     breaks = np.zeros(shape[1])
-    slope = 3 / ore.weibull_modulus
-    with np.errstate(over="ignore"):  # a vanishing stress needs an infinite reach: nothing breaks
-        reach_needed = np.exp(-log_stress / (slope or 1.0))
-    constants = (
-        slope, 1 / (2 * ore.cushioning**2), 1 / ore.fragment_exponent, ore.strength_size, ore.size_floor,
-    )  # fmt: skip
+    reach_needed = parcels.reach_needed(scene, log_stress)
     for photograph in range(shape[0]):
         for line in range(shape[1]):
-            product[photograph, line], streams = first_cells(scene, seed, (replicate, line, photograph))
+            product[photograph, line], streams = parcels.first_cells(scene, seed, (replicate, line, photograph))
             breaks[line] += kernels.march(
                 product[photograph, line], streams, log_stress[line], reach_needed[line], sieves,
                 _NO_SNAPSHOTS if size is None else size[photograph, line],
                 _NO_CLASSES if classes is None else classes[photograph, line],
-                *constants,
+                *parcels.constants(scene),
             )  # fmt: skip
-    pooled = np.sort(product.transpose(1, 0, 2).reshape(shape[1], -1), axis=1)
+    return _summarised(scene, product, breaks, size, classes)
+
+
+def _run_lattice(scene, log_stress, time_step, rates, seed, replicate) -> Crushed:
+    """Run the lattice through one residence time to the steady photographs, and the start-up's if wished."""
+    grid, wishes = scene.resolution, scene.exchange
+    last = grid.points - 1  # the step at which the first parcel that entered is at the exit
+    steady = [last + k * wishes.interval for k in range(grid.photographs)]
+    steps = [*(range(0, last, wishes.interval) if wishes.record_startup else ()), *steady]
+    machine = Lattice(scene, log_stress, rates, seed, replicate, {step: k for k, step in enumerate(steady)})
+    shape = (len(steps), *log_stress.shape)
+    product = np.empty((len(steady), shape[1], grid.cells), np.float32)
+    size = np.empty((*shape, grid.cells), np.float32) if grid.record == "cells" else None
+    sieves = np.array(grid.sieves)
+    classes = np.empty((*shape, sieves.size + 1), np.int64) if grid.record == "distributions" else None
+    breaks = np.zeros(shape[1])
+    taken = 0
+    for step in range(steps[-1] + 1):
+        machine.advance(step)
+        if step != steps[taken]:
+            continue
+        if size is not None:
+            size[taken] = machine.sizes[machine.slots]
+        if classes is not None:
+            classes[taken] = machine.classes(sieves)
+        if step >= last:
+            at_exit = machine.slots[:, -1]
+            product[taken - len(steps)] = machine.sizes[at_exit]
+            breaks += machine.breaks[at_exit]
+        taken += 1
+    residences = (steps[-1] + 1) / grid.points
+    exchanged = Exchanged(
+        elapsed_time=np.array(steps) * time_step,
+        steady=np.array(steps) >= last,
+        passes=machine.most_passes,
+        swaps_per_cell=2 * machine.swaps / (machine.sizes.size * residences),
+    )
+    return _summarised(scene, product, breaks, size, classes)._replace(exchanged=exchanged)
+
+
+def _summarised(scene, product, breaks, size, classes) -> Crushed:
+    """Sum up the product (photograph, streamline, cell), photographs pooled; breaks come as their total."""
+    grid = scene.resolution
+    pooled = np.sort(product.transpose(1, 0, 2).reshape(product.shape[1], -1), axis=1)
     return Crushed(
         breaks=breaks / pooled.shape[1],
-        below_floor=_passing(pooled, [np.nextafter(ore.size_floor, 0.0)])[:, 0],
+        below_floor=_passing(pooled, [np.nextafter(scene.material.size_floor, 0.0)])[:, 0],
         passing=_passing(pooled, grid.sieves),
         percentiles=np.quantile(pooled, FRACTIONS, axis=1),
         total_percentiles=np.quantile(pooled, FRACTIONS),
         size=size,
         mass_fraction=None if classes is None else classes[..., :-1] / grid.cells,
     )
-
-
-def first_cells(scene: Scene, seed: int, key: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return sizes (float32, m) and random streams (uint64) of the cells of a parcel of feed.
-
-    The parcel's `key` (replicate, streamline, front) and `seed` decide every bit of both.
-    """
-    source = np.random.SeedSequence(seed, spawn_key=key)
-    streams = np.empty(scene.resolution.cells, np.uint64)
-    kernels.start_streams(source.generate_state(1, np.uint64)[0], streams)
-    return np.maximum(feed.draw(scene.feed, streams.size, source), kernels.SMALLEST), streams
 
 
 def _passing(rows: np.ndarray, sieves) -> np.ndarray:

@@ -1,10 +1,12 @@
 """What several test files share: scenes of small size, lines of cells, and one call of the crushing kernel."""
 
+import inspect
 import math
 
 import numba
 import numpy as np
-from hpgr import kernels, presets
+
+from hpgr import feed, kernels, presets, solve
 
 COMPILED = not numba.config.DISABLE_JIT
 
@@ -84,3 +86,20 @@ def ks_distance(sample, distribution):
     exact = distribution(ordered)
     count = np.arange(ordered.size + 1) / ordered.size
     return max(np.max(count[1:] - exact), np.max(exact - count[:-1]))
+
+
+def crush(scene, stress, seed=0, replicate=0):
+    """Crush a scene without exchange under a given stress (streamline, point)."""
+    known = {"scene": scene, "stress": stress, "seed": seed, "replicate": replicate}
+    return solve.crush(**{name: known.get(name) for name in inspect.signature(solve.crush).parameters})
+
+
+def first_cells(scene, seed, key):
+    """The cells of a parcel of feed, as the model page has it: every bit keyed by seed and key.
+
+    Written out here, so that the product of a scene in which nothing breaks is compared with something else.
+    """
+    source = np.random.SeedSequence(seed, spawn_key=key)
+    found = np.empty(scene.resolution.cells, np.uint64)
+    kernels.start_streams(source.generate_state(1, np.uint64)[0], found)
+    return np.maximum(feed.draw(scene.feed, found.size, source), np.float32(kernels.SMALLEST)), found

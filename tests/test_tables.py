@@ -1,4 +1,5 @@
 import pytest
+
 from hpgr import Feed, presets, tables
 
 

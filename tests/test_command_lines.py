@@ -1,0 +1,439 @@
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import hpgr
+from studies import feed_sweep, gap_sweep, speed_sweep
+
+SMALL = ["--cells", "60", "--points", "40", "--streamlines", "3"]
+STUDIES = {"gap_sweep": gap_sweep, "speed_sweep": speed_sweep, "feed_sweep": feed_sweep}
+SCENE = """
+[rolls]
+diameter = "0.8 m"
+width = "0.25 m"
+gap = "19 mm"
+entry_gap = "163 mm"
+speed = "16 rpm"
+
+[feed]
+kind = "uniform"
+bottom_size = "1 mm"
+top_size = "20 mm"
+"""
+SINGLE = SCENE.replace("uniform", "single").replace('bottom_size = "1 mm"\ntop_size', "size")
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """Every command runs in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def run(capsys):
+    """Run a study; return its exit code, standard output and standard error."""
+
+    def call(*arguments, study=gap_sweep):
+        code = study.main([*SMALL, *arguments])
+        return (code, *capsys.readouterr())
+
+    return call
+
+
+@pytest.fixture
+def refused(run, folder, monkeypatch):
+    """Assert that a command is refused before anything runs, and return its message."""
+
+    def call(*arguments, study=gap_sweep):
+        before = sorted(folder.rglob("*"))
+        with monkeypatch.context() as patch:
+            patch.setattr("studies.sweep.sweep", None)  # calling it would raise a TypeError
+            code, out, err = run(*arguments, study=study)
+        assert code == 2
+        assert out == ""
+        assert err.startswith("error: ")
+        assert sorted(folder.rglob("*")) == before
+        return err
+
+    return call
+
+
+def files(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def opened(path):
+    with xr.open_dataset(path) as dataset:
+        return dataset.load()
+
+
+def python(*arguments):
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, timeout=300)
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_defaults(run, folder, name):
+    code, out, err = run(study=STUDIES[name])
+    assert code == 0, err
+    assert files(folder) == [f"outputs/{name}.nc", f"outputs/{name}.png"]
+    assert (folder / "outputs" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert f"wrote outputs/{name}.nc and outputs/{name}.png" in out
+    assert STUDIES[name].STUDY.caption in out
+    result = opened(f"outputs/{name}.nc")
+    axis, own = {
+        "gap_sweep": ("gap", 0.06),
+        "speed_sweep": ("roll_speed", 19 * np.pi / 30),
+        "feed_sweep": ("feed_top_size", 0.06),
+    }[name]
+    assert result["p80_total"].dims == (axis, "replicate")
+    assert result.sizes["replicate"] == 3
+    assert result[axis].size >= 4
+    assert (np.diff(result[axis]) > 0).all()
+    assert np.isclose(result[axis], own, rtol=1e-3).sum() == 1  # the scene itself is one of the points
+    assert (result["status"] == 0).all()
+    assert result.attrs["history"] == f"python -m studies.{name} {' '.join(SMALL)}"
+
+
+def test_speed_study_says_that_only_throughput_changes(run):
+    _, out, _ = run("--no-plot", study=speed_sweep)
+    assert "speed changes throughput and nothing else" in out
+
+
+@pytest.mark.parametrize(
+    ("name", "dims"),
+    [
+        ("gap_sweep", ["gap", "roll_speed", "feed_top_size"]),
+        ("speed_sweep", ["roll_speed", "gap", "feed_top_size"]),
+        ("feed_sweep", ["feed_top_size", "gap", "roll_speed"]),
+    ],
+)
+def test_further_axes(run, name, dims):
+    code, out, _ = run(
+        "--gap", "40 mm", "0.05 m", "--roll-speed", "15 rpm", "2 rad/s", "--feed-top-size", "5 cm", "60 mm",
+        "--replicates", "1", "--out", "all", study=STUDIES[name],
+    )  # fmt: skip
+    assert code == 0
+    result = opened("all.nc")
+    assert result["p80_total"].dims == (*dims, "replicate")
+    assert result["gap"].values.tolist() == [0.04, 0.05]
+    assert result["roll_speed"].values == pytest.approx([np.pi / 2, 2], rel=1e-12)
+    assert result["feed_top_size"].values == pytest.approx([0.05, 0.06], rel=1e-12)
+    heading = {"gap": "gap [mm]", "roll_speed": "roll speed [rpm]", "feed_top_size": "feed top size [mm]"}
+    assert re.split(r"\s{2,}", out.splitlines()[0].strip())[:3] == [heading[name] for name in dims]
+    assert "±" not in out
+
+
+def test_default_main_axis_comes_before_further_axes(run):
+    assert run("--gap", "40 mm", "50 mm", "--replicates", "1", "--no-plot", study=speed_sweep)[0] == 0
+    result = opened("outputs/speed_sweep.nc")
+    assert result["throughput"].dims == ("roll_speed", "gap", "replicate")
+    assert result.sizes["roll_speed"] == 6
+
+
+def test_table_agrees_with_the_file(run):
+    _, out, _ = run("--gap", "40 mm", "60 mm", "--sieve", "2 mm", "--no-plot")
+    heading, *rows = [re.split(r"\s{2,}", line.strip()) for line in out.splitlines()[:3]]
+    assert heading == [
+        "gap [mm]", "throughput [t/h]", "P50 [mm]", "P80 [mm]", "below 2 mm [%]", "peak pressure [MPa]",
+    ]  # fmt: skip
+    result = opened("outputs/gap_sweep.nc")
+    logs = np.log(result["sieve"].values)
+    for k, (gap, *shown) in enumerate(rows):
+        case = result.isel(gap=k)
+        assert float(gap) == pytest.approx(float(case["gap"]) * 1e3)
+        below = [100 * np.interp(np.log(2e-3), logs, one) for one in case["passing_total"].values]
+        columns = [case["throughput"] * 3.6, case["p50_total"] * 1e3, case["p80_total"] * 1e3, below]
+        columns.append(case["peak_pressure"] / 1e6)
+        for text, values in zip(shown, columns, strict=True):
+            mean, spread = map(float, text.split(" ± "))
+            values = np.asarray(values, float)
+            assert mean == pytest.approx(values.mean(), rel=6e-4)  # 4 digits are shown
+            assert spread == pytest.approx(values.std(ddof=1), rel=0.06, abs=1e-12 * mean)  # 2 digits
+    assert all(float(row[1].split(" ± ")[1]) == 0 for row in rows)  # throughput knows no chance
+    assert all(float(row[3].split(" ± ")[1]) > 0 for row in rows)
+    assert "(mean ± standard deviation of 3 replicates)" in out
+
+
+def test_no_plot(run, folder):
+    code, out, _ = run("--gap", "40 mm", "--no-plot")
+    assert code == 0
+    assert files(folder) == ["outputs/gap_sweep.nc"]
+    assert ".png" not in out
+
+
+@pytest.mark.parametrize(
+    ("given", "made"),
+    [("deep/run.nc", "deep/run"), ("run", "run"), ("run.v2", "run.v2")],
+)
+def test_out(run, folder, given, made):
+    code, _, _ = run("--gap", "40 mm", "--replicates", "1", "--out", given)
+    assert code == 0
+    assert f"{made}.nc" in files(folder)
+    assert f"{made}.png" in files(folder)
+    assert len(files(folder)) == 2
+
+
+def test_older_files_are_replaced(run, folder):
+    (folder / "outputs").mkdir()
+    for name in ("gap_sweep.nc", "gap_sweep.png"):
+        (folder / "outputs" / name).write_bytes(b"old")
+    assert run("--gap", "40 mm", "--replicates", "1")[0] == 0
+    assert (folder / "outputs" / "gap_sweep.png").read_bytes().startswith(b"\x89PNG")
+    assert opened("outputs/gap_sweep.nc")["gap"].values.tolist() == [0.04]
+    assert len(files(folder)) == 2
+
+
+def test_seed_and_replicates(run):
+    for name, options in {"a": ["--seed", "7"], "b": ["--seed", "7", "--workers", "1"], "c": ["--seed", "8"]}.items():
+        assert run("--gap", "40 mm", "--replicates", "2", "--no-plot", "--out", name, *options)[0] == 0
+    a, b, c = (opened(f"{name}.nc") for name in "abc")
+    assert a.attrs["seed"] == 7
+    assert np.array_equal(a["passing"], b["passing"])
+    assert not np.array_equal(a["passing"], c["passing"])
+
+
+def test_resolution_options_reach_the_scene(run):
+    run("--gap", "40 mm", "--replicates", "1", "--no-plot")
+    grid = hpgr.Scene.model_validate_json(opened("outputs/gap_sweep.nc").attrs["scene"]).resolution
+    assert (grid.cells, grid.points, grid.streamlines) == (60, 40, 3)
+
+
+def test_stress_only(run, folder):
+    code, out, _ = run("--gap", "40 mm", "50 mm", "--cells", "0")
+    assert code == 0
+    assert re.split(r"\s{2,}", out.splitlines()[0].strip()) == ["gap [mm]", "throughput [t/h]", "peak pressure [MPa]"]
+    assert files(folder) == ["outputs/gap_sweep.nc", "outputs/gap_sweep.png"]
+    assert "passing" not in opened("outputs/gap_sweep.nc")
+
+
+def test_dry_run_lists_cases_and_writes_nothing(run, folder, monkeypatch):
+    monkeypatch.setattr(hpgr, "simulate", None)
+    code, out, err = run("--gap", "40 mm", "1.2 m", "--roll-speed", "15 rpm", "19 rpm", "--dry-run")
+    assert (code, err) == (0, "")
+    assert files(folder) == []
+    rows = [line for line in out.splitlines() if re.match(r"\s+(40|1200) mm", line)]
+    assert len(rows) == 4
+    assert re.search(r"gap \[mm\]\s+roll speed \[rpm\]\s+memory\s+time", out)
+    assert all(re.search(r"40 mm\s+1[59] rpm\s+[\d.]+ MB\s+[\d.]+ ms$", row) for row in rows[:2])
+    assert all("refused: rolls.gap: got 1200 mm" in row for row in rows[2:])
+    assert "12 cases (3 replicates each)" in out
+
+
+def test_dry_run_predicts_more_for_more_cells(run):
+    def time(cells):
+        _, out, _ = run("--gap", "40 mm", "--dry-run", "--cells", cells)
+        memory, time = re.search(r"([\d.]+) MB\s+([\d.]+) ms", out).groups()
+        return float(memory), float(time)
+
+    few, many = time("1000"), time("1000000")
+    assert many[0] > 10 * few[0]
+    assert many[1] > 10 * few[1]
+
+
+def test_scene_from_toml_and_json(run, folder):
+    (folder / "mine.toml").write_text(SCENE)
+    assert run("--scene", "mine.toml", "--no-plot", "--out", "toml")[0] == 0
+    result = opened("toml.nc")
+    scene = hpgr.Scene.model_validate_json(result.attrs["scene"])
+    assert (scene.rolls.diameter, scene.feed.top_size) == (0.8, 0.02)
+    assert np.isclose(result["gap"], 0.019).sum() == 1
+    (folder / "again.json").write_text(result.attrs["scene"])  # a result's own scene is an input
+    assert run("--scene", "again.json", "--no-plot", "--out", "json")[0] == 0
+    again = opened("json.nc")
+    again.attrs["history"] = result.attrs["history"]
+    xr.testing.assert_identical(again, result)
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_khd_pilot_says_that_it_is_uncalibrated(run, name):
+    code, out, _ = run("--scene", "khd_pilot", "--no-plot", "--replicates", "1", study=STUDIES[name])
+    assert code == 0
+    assert "note: uncalibrated" in out
+    scene = hpgr.Scene.model_validate_json(opened(f"outputs/{name}.nc").attrs["scene"])
+    assert (scene.rolls.diameter, scene.rolls.width) == (0.8, 0.25)
+    assert "uncalibrated" in scene.note
+
+
+def test_feed_table_beside_the_scene_file(run, folder):
+    (folder / "in").mkdir()
+    (folder / "in" / "ore.csv").write_text("size_mm,percent_passing\n31.75,100\n10,50\n1,0\n")
+    start = SCENE.partition("[feed]")[0]
+    (folder / "in" / "mine.toml").write_text(start + '[feed]\nkind = "table"\ntable = "ore.csv"\n')
+    assert run("--scene", "in/mine.toml", "--no-plot")[0] == 0
+    # 31.75 mm is no round number: the default axis must not reach beyond it
+    code, _, err = run("--scene", "in/mine.toml", "--no-plot", study=feed_sweep)
+    assert (code, [line for line in err.splitlines() if "refused" in line]) == (0, [])
+
+
+def test_lost_cases_are_named_and_exit_code_is_1(run, folder):
+    code, out, err = run("--gap", "40 mm", "1.2 m")
+    assert code == 1
+    [line] = [line for line in err.splitlines() if line.startswith("refused")]
+    assert line.startswith("refused: gap 1200 mm, 3 of 3 replicates: rolls.gap: got 1200 mm; must be at most")
+    assert "entry gap 1140 mm" in line
+    assert re.search(r"^\s+1200(\s+-){5}$", out, re.MULTILINE)
+    assert files(folder) == ["outputs/gap_sweep.nc", "outputs/gap_sweep.png"]
+
+
+def test_failing_case_is_named(run, monkeypatch):
+    real = hpgr.simulate
+
+    def simulate(scene, seed, replicate):
+        if replicate == 1:
+            raise RuntimeError("boom")
+        return real(scene, seed, replicate)
+
+    monkeypatch.setattr(hpgr, "simulate", simulate)
+    code, out, err = run("--gap", "40 mm", "--no-plot")
+    assert code == 1
+    assert "failed: gap 40 mm, 1 of 3 replicates: RuntimeError: boom" in err
+    assert "±" in out  # of the two that are left
+
+
+def test_no_result_at_all(run, folder):
+    code, out, err = run("--gap", "1.2 m", "2 m")
+    assert code != 0
+    assert "no case holds a result" in out + err
+    assert err.count("refused: gap") == 2
+    assert "outputs/gap_sweep.png" not in files(folder)
+
+
+def test_feed_of_one_size_has_no_top_size(run, folder):
+    (folder / "single.toml").write_text(SINGLE)
+    code, _, err = run("--scene", "single.toml", study=feed_sweep)
+    assert code != 0
+    assert "feed.top_size" in err
+    assert "a single feed has no such field" in err
+    assert run("--scene", "single.toml", "--no-plot", study=gap_sweep)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--gap", "40"], ["gap", "'40'", "without a unit", "40 mm"]),
+        (["--gap", "40 parsnips"], ["gap", "40 parsnips"]),
+        (["--gap", "40 kg"], ["gap", "40 kg", "mm"]),
+        (["--gap", "-40 mm"], ["gap", "-40 mm", "greater than 0"]),
+        (["--gap", "40 mm", "4 cm"], ["gap", "0.04", "twice"]),
+        (["--roll-speed", "3 m"], ["speed", "3 m", "rpm"]),
+        (["--feed-top-size", "nan mm"], ["top_size", "NaN"]),
+        (["--scene", "moon"], ["--scene", "'moon'", "paper", "khd_pilot", ".toml"]),
+        (["--scene", "gone.toml"], ["gone.toml"]),
+        (["--scene", "gone.json"], ["gone.json"]),
+        (["--workers", "0"], ["--workers", "0", "at least 1"]),
+        (["--replicates", "0"], ["--replicates", "0", "at least 1"]),
+        (["--seed", "-1"], ["--seed", "-1", "at least 0"]),
+        (["--sieve", "3 m"], ["--sieve", "'3 m'", "1000 mm"]),
+        (["--sieve", "1 nm"], ["--sieve", "'1 nm'", "0.001 mm"]),
+        (["--sieve", "1"], ["--sieve", "without a unit"]),
+        (["--sieve", "1 s"], ["--sieve"]),
+        (["--cells", "-1"], ["cells", "-1", "at least 0"]),
+        (["--points", "1"], ["points", "at least 2"]),
+        (["--streamlines", "0"], ["streamlines", "at least 1"]),
+    ],
+)
+def test_bad_options_are_refused(refused, arguments, words):
+    message = refused(*arguments)
+    for word in words:
+        assert word in message
+
+
+def test_seed_that_no_file_can_hold(run, folder):
+    # NetCDF attributes are 64 bits: either refused at once, or written whole, but no sweep run in vain
+    code, _, err = run("--gap", "40 mm", "--no-plot", "--seed", str(2**70))
+    if code == 2:
+        assert "--seed" in err
+        assert files(folder) == []
+    else:
+        assert (code, str(opened("outputs/gap_sweep.nc").attrs["seed"])) == (0, str(2**70))
+
+
+@pytest.mark.parametrize("arguments", [["--cells", "many"], ["--cels", "60"], ["--seed"], ["surprise"]])
+def test_unknown_options_are_refused(folder, capsys, arguments):
+    with pytest.raises(SystemExit) as caught:
+        gap_sweep.main(arguments)
+    assert caught.value.code == 2
+    said = capsys.readouterr()
+    assert arguments[0] in said.out + said.err
+    assert files(folder) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("bad.toml", "[rolls\n", ["bad.toml", "not TOML", "line 1"]),
+        ("bad.json", "{", ["scene is refused", "JSON"]),
+        ("empty.toml", "", ["rolls", "feed", "required"]),
+        (
+            "faulty.toml",
+            SCENE.replace('"0.8 m"', "true").replace('"19 mm"', '"19"').replace('"16 rpm"', '"-16 rpm"')
+            .replace("bottom_size", "botom_size").replace('"20 mm"', '"200 mm"') + "\n[flows]\nexponent = 1\n",
+            ["rolls.diameter", "rolls.gap", "rolls.speed", "feed.botom_size", "feed.bottom_size", "flows",
+             "did you mean 'bottom_size'", "did you mean 'flow'", "feed.top_size", "entry gap"],
+        ),
+        ("wide.toml", SCENE.replace('"19 mm"', '"190 mm"'), ["rolls.gap", "190 mm", "163 mm", "narrow the gap"]),
+    ],
+)  # fmt: skip
+def test_impossible_scenes_are_refused_with_every_fault(refused, folder, name, content, words):
+    (folder / name).write_text(content)
+    message = refused("--scene", name)
+    for word in words:
+        assert word in message
+
+
+def test_scene_too_large_for_this_machine(run):
+    code, _, err = run("--gap", "40 mm", "--cells", "2000000000", "--streamlines", "10000", "--replicates", "1")
+    assert code != 0
+    assert "predicted" in err
+    assert "bytes" in err
+
+
+def test_out_that_cannot_be_written(run, folder):
+    (folder / "file").write_text("not a folder")
+    code, _, err = run("--gap", "40 mm", "--replicates", "1", "--out", "file/run.nc")
+    assert code == 2
+    assert "could not write the result" in err
+    assert files(folder) == ["file"]
+
+
+def test_module_runs_as_a_command(folder, monkeypatch):
+    # without the compiler NumPy speaks up when a 64-bit stream wraps, which is what it is there for
+    monkeypatch.setenv("PYTHONWARNINGS", "ignore:overflow encountered in scalar:RuntimeWarning")
+    done = python("-m", "studies.gap_sweep", *SMALL, "--gap", "40 mm", "1.2 m", "--out", "run.nc")
+    assert done.returncode == 1, done.stderr
+    assert "gap [mm]" in done.stdout
+    assert "6 of 6 cases" in done.stderr  # progress in plain lines where no terminal is watching
+    assert "Warning" not in done.stderr
+    assert files(folder) == ["run.nc", "run.png"]
+    result = opened("run.nc")
+    assert (
+        result.attrs["history"] == f"python -m studies.gap_sweep {' '.join(SMALL)} --gap '40 mm' '1.2 m' --out run.nc"
+    )
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_help_explains_every_option(name):
+    done = python("-m", f"studies.{name}", "--help")
+    assert done.returncode == 0
+    for option in [
+        "--gap", "--roll-speed", "--feed-top-size", "--scene", "--replicates", "--cells", "--points", "--streamlines",
+        "--sieve", "--workers", "--scheduler", "--seed", "--out", "--no-plot", "--dry-run",
+    ]:  # fmt: skip
+        assert re.search(rf"{option}\b", done.stdout), option
+    assert f"python -m studies.{name}" in done.stdout
+
+
+_LATE = ("numba", "xarray", "matplotlib", "distributed", "dask", "netCDF4", "scipy", "pint")
+
+
+def test_import_loads_nothing_heavy():
+    # what makes `--help` quick, counted in modules rather than seconds
+    done = python("-c", "import studies.gap_sweep, sys; print(*sys.modules)")
+    loaded = set(done.stdout.split())
+    assert "studies.command" in loaded
+    assert not loaded & set(_LATE)

@@ -1,0 +1,205 @@
+import math
+
+import numpy as np
+import pytest
+from support import KS, SIGMAS, crush, feed_values, first_cells, paper, sized
+
+from hpgr import feed, flow, geometry, kernels, limits, presets, simulate, solve, stress
+
+INF = math.inf
+NO_CUSHION = 1e9  # as good as inf, for which the closed form would take over
+
+
+def load(scene, points=61):
+    bed = geometry.bed(scene.rolls, scene.resolution.streamlines)
+    motion = flow.move(scene, bed, points)
+    return stress.crushing_stress(scene, motion, stress.load(scene, motion))
+
+
+@pytest.mark.parametrize(
+    ("values", "solver"),
+    [
+        ({"resolution.cells": 0}, "stress only"),
+        ({"resolution.cells": 0, "material.cushioning": INF, "resolution.record": "product"}, "stress only"),
+        ({}, "march"),
+        ({"material.cushioning": INF}, "march"),  # cells are wanted
+        ({"material.cushioning": INF, "resolution.record": "product"}, "closed form"),
+        ({"material.cushioning": INF, "resolution.record": "distributions"}, "closed form"),
+        (
+            {"material.cushioning": INF, "material.weibull_modulus": INF, "resolution.record": "product"},
+            "march",  # without size effect there is no critical size
+        ),
+        ({"material.cushioning": 100.0, "resolution.record": "product"}, "march"),
+    ],
+)
+def test_the_cheapest_solver_is_chosen_and_told(values, solver):
+    scene = paper(values)
+    assert solve.choose(scene) == solver
+    assert simulate(scene).attrs["solver"] == solver
+
+
+def test_closed_form_draws_no_cells(monkeypatch):
+    def refuse(*args, **kwargs):
+        raise AssertionError("cell work")
+
+    monkeypatch.setattr(kernels, "march", refuse)
+    monkeypatch.setattr(feed, "draw", refuse)
+    scene = paper({"material.cushioning": INF, "resolution.record": "product"})
+    assert simulate(scene)["p80_total"] > 0
+    with pytest.raises(AssertionError, match="cell work"):
+        simulate(paper())
+
+
+@pytest.mark.parametrize("gamma", [0.35, 1.0])
+def test_closed_form_is_the_limit_of_the_march(gamma):
+    """KS at 1e-6 on every sieve, plus 0.5 % for grains that the last steps before the peak leave unfinished."""
+    cells = sized(50_000, 1_000)
+    closed = paper({"material.cushioning": INF, "material.fragment_exponent": gamma, "resolution.record": "product"})
+    marched = closed.with_values({"material.cushioning": NO_CUSHION, "resolution.cells": cells})
+    history = load(closed, 1601)
+    exact, found = crush(closed, history, 0, 0), crush(marched, history, 0, 0)
+    assert np.max(np.abs(found.passing - exact.passing)) < 0.005 + KS / math.sqrt(cells)
+    # breaks scatter like a Poisson number, percentiles in passing like a binomial one
+    assert found.breaks == pytest.approx(exact.breaks, abs=0.02 + SIGMAS * math.sqrt(4 / cells))
+    for fraction, size in zip((0.5, 0.8), found.total_percentiles, strict=True):
+        critical = limits.critical_size(np.log(history.max(axis=1) / 0.84e6), closed.material)
+        there = limits.crushed_passing(closed.feed, float(size), critical, gamma).mean()
+        assert abs(there - fraction) < 0.005 + SIGMAS * math.sqrt(fraction * (1 - fraction) / (3 * cells))
+
+
+def test_total_percentiles_are_those_of_the_mixture():
+    scene = paper({"material.cushioning": INF, "resolution.record": "product"})
+    history = load(scene)
+    found = crush(scene, history, 0, 0)
+    critical = limits.critical_size(np.log(history.max(axis=1) / 0.84e6), scene.material)
+    for fraction, size in zip((0.5, 0.8), found.total_percentiles, strict=True):
+        mixture = limits.crushed_passing(scene.feed, size, critical, 1.0).mean()
+        assert mixture == pytest.approx(fraction, rel=1e-9)
+    assert np.all(found.percentiles[:, 0] < found.total_percentiles)
+    assert np.all(found.total_percentiles < found.percentiles[:, -1])
+
+
+def test_closed_form_distributions_are_cumulative_along_the_path():
+    """A4: at every point the smallest critical size met so far decides, also past the peak."""
+    scene = paper({"material.cushioning": INF, "resolution.record": "distributions"})
+    found = crush(scene, load(scene), 0, 0)
+    passing = np.cumsum(found.mass_fraction[0], axis=-1)
+    assert np.all(np.diff(passing, axis=1) >= -1e-12)
+    assert passing[:, -1] == pytest.approx(found.passing, abs=1e-12)
+
+
+def test_a_streamline_does_not_depend_on_the_others():
+    """Keyed by (replicate, streamline, photograph): the first streamlines of many are those of few, bit for bit."""
+    scene = paper({"resolution.photographs": 2})
+    history = load(scene)
+    whole = crush(scene, history, 3, 1)
+    for count in (1, 2):
+        part = crush(scene, history[:count], 3, 1)
+        assert np.array_equal(part.size, whole.size[:, :count])
+        assert np.array_equal(part.passing, whole.passing[:count])
+        assert np.array_equal(part.percentiles, whole.percentiles[:, :count])
+        assert np.array_equal(part.breaks, whole.breaks[:count])
+
+
+def test_streamlines_under_the_same_stress_are_independent():
+    """Correlation of their products: |r| sqrt(M) beyond 5 once in 1.7 million, and no cells in common."""
+    cells = sized(2000, 300)
+    scene = paper({"resolution.cells": cells})
+    product = crush(scene, np.repeat(load(scene)[:1], 3, axis=0), 0, 0).size[0, :, -1]
+    for first, second in ((0, 1), (0, 2), (1, 2)):
+        assert abs(np.corrcoef(product[first], product[second])[0, 1]) * math.sqrt(cells) < 5
+        assert np.intersect1d(product[first], product[second]).size < 5
+
+
+def test_a_photograph_does_not_depend_on_the_others():
+    scene = paper({"resolution.photographs": 3})
+    history = load(scene)
+    three = crush(scene, history, 3, 1).size
+    one = crush(paper(), history, 3, 1).size
+    assert np.array_equal(three[:1], one)
+
+
+def test_keys_tell_every_parcel_apart():
+    scene = paper({"resolution.cells": 500})
+    keys = [(0, (0, 0, 0)), (1, (0, 0, 0)), (0, (1, 0, 0)), (0, (0, 1, 0)), (0, (0, 0, 1)), (2**64, (0, 0, 0))]
+    parcels = [first_cells(scene, seed, key) for seed, key in keys]
+    for k, (sizes, streams) in enumerate(parcels):
+        for other_sizes, other_streams in parcels[:k]:
+            assert not np.array_equal(sizes, other_sizes)
+            assert np.intersect1d(streams, other_streams).size == 0
+    again = first_cells(scene, 0, (0, 0, 0))
+    assert np.array_equal(parcels[0][0], again[0])
+    assert np.array_equal(parcels[0][1], again[1])
+    assert parcels[0][0].dtype == np.float32
+    assert parcels[0][1].dtype == np.uint64
+    assert np.unique(parcels[0][1]).size == 500
+
+
+def test_a_feed_from_zero_holds_no_grain_of_size_zero():
+    scene = paper(feed_values(kind="power_law", top_size=0.06, exponent=0.1) | {"resolution.cells": 5000})
+    sizes, _ = first_cells(scene, 0, (0, 0, 0))
+    assert sizes.min() >= np.float32(kernels.SMALLEST)
+
+
+def test_summaries_are_those_of_the_recorded_cells():
+    scene = paper({"resolution.photographs": 2, "material.size_floor": "3 mm"})
+    found = crush(scene, load(scene), 0, 0)
+    product = found.size[:, :, -1].transpose(1, 0, 2).reshape(3, -1).astype(float)
+    assert found.percentiles == pytest.approx(np.quantile(product, [0.5, 0.8], axis=1), rel=1e-6)
+    assert found.total_percentiles == pytest.approx(np.quantile(product, [0.5, 0.8]), rel=1e-6)
+    below = np.mean(product < 0.003, axis=1)
+    assert np.array_equal(found.below_floor, below)
+    assert 0 < below[0] < 1
+    sieves = np.array(scene.resolution.sieves)
+    assert np.array_equal(found.passing, np.mean(product[:, :, None] <= sieves, axis=1))
+
+
+# Section 11 of the model page: figures of a separate program with 1,601 points and 400,000 cells.
+REFERENCE = {
+    INF: ((0.921, 0.938, 1.012), (1.470, 1.504, 1.619), (3.79, 3.78, 3.71)),
+    1.0: ((1.028, 1.052, 1.131), (1.642, 1.680, 1.810), (3.68, 3.66, 3.59)),
+}
+
+
+def machine_history(points, lines=(0, 4, 9)):
+    scene = presets.paper().with_values({"resolution.streamlines": 10})
+    return load(scene, points)[list(lines)]
+
+
+def ordered_error(cells):
+    """Relative standard errors of P50 and P80, and that of breaks per cell.
+
+    For a uniform product (n = inf, gamma = 1) they are 1 / sqrt(M) and 0.5 / sqrt(M) exactly; the product with
+    cushioning is nearly so. The breaks have the variance of a Poisson number, 2.7, and of the feed, 0.3.
+    """
+    return 1 / math.sqrt(cells), 0.5 / math.sqrt(cells), math.sqrt(3 / cells)
+
+
+@pytest.mark.parametrize("n", REFERENCE)
+def test_converged_figures_of_the_papers_machine(n):
+    """5 sigma of both programs' sampling, and the rounding of the printed figures."""
+    cells = sized(100_000, 1_000)
+    scene = paper(
+        {"material.cushioning": min(n, NO_CUSHION), "resolution.cells": cells, "resolution.record": "product"}
+    )
+    found = crush(scene, machine_history(1601), 71, 0)
+    p50, p80, breaks = REFERENCE[n]
+    both = zip(ordered_error(cells), ordered_error(4e5), strict=True)
+    errors = [SIGMAS * math.hypot(*pair) for pair in both]
+    assert found.percentiles[0] * 1e3 == pytest.approx(p50, rel=errors[0] + 0.0005)
+    assert found.percentiles[1] * 1e3 == pytest.approx(p80, rel=errors[1] + 0.0004)
+    assert found.breaks == pytest.approx(breaks, abs=errors[2] + 0.005)
+
+
+def test_strong_cushioning_needs_small_time_steps():
+    """n = 1/2: P80 at xi = 0.05 still moves with dt. 5 sigma of sampling and the rounding of the figures."""
+    cells = sized(100_000, 2_000)
+    scene = paper({"material.cushioning": 0.5, "resolution.cells": cells, "resolution.record": "product"})
+    found = []
+    figures = sized({101: 2.29, 201: 2.47, 401: 2.61, 801: 2.69, 1601: 2.75}, {101: 2.29, 401: 2.61})
+    for points, figure in figures.items():
+        p80 = 1e3 * crush(scene, machine_history(points, (0,)), 72, 0).percentiles[1, 0]
+        # cushioning widens the product's upper end: its P80 scatters up to twice as much as the uniform law's
+        assert p80 == pytest.approx(figure, rel=SIGMAS * 2 * ordered_error(cells)[1] + 0.0025)
+        found.append(p80)
+    assert np.all(np.diff(found) > 0)
