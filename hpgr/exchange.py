@@ -19,7 +19,7 @@ from hpgr.stress import Load
 from hpgr.tessellation import Tessellation
 
 LARGEST_SUM = 0.5  # of the swap probabilities of a cell in one pass; above it swaps overshoot their equilibrium
-MOST_PASSES = 1024  # per time step; a scene that needs more is refused
+MOST_PASSES = 1000  # per time step; a scene that needs more is refused
 _SECONDS_PER_EDGE = 1e-8  # of one pass over an edge without swaps
 
 
@@ -61,10 +61,10 @@ def swap_rates(scene: Scene, motion: Motion, state: Load, cells: Tessellation) -
 
 
 def passes_needed(rates: SwapRates, mixing: np.ndarray, means: np.ndarray, largest: float) -> np.ndarray:
-    """Return into how many passes of a time step each edge is split, a power of 2.
+    """Return in how many passes of a time step each edge takes part, with its probability split between them.
 
-    In each pass the probabilities of any cell then sum to at most 1/2: an edge takes part as often as the
-    needier of its two parcels must.
+    As many as the needier of its two parcels must have: then the probabilities of any cell sum to at most 1/2
+    in each pass.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def passes_needed(rates: SwapRates, mixing: np.ndarray, means: np.ndarray, large
     lower, upper = rates.pairs.T
     most = mixing + rates.rise * (np.maximum(largest - means[lower], 0) + means[upper])
     sums = np.bincount(lower, most, means.size) + np.bincount(upper, most, means.size)
-    needed = 2.0 ** np.ceil(np.log2(np.maximum(sums / LARGEST_SUM, 1.0)))
+    needed = np.maximum(np.ceil(sums / LARGEST_SUM), 1.0)
     return np.maximum(needed[lower], needed[upper]).astype(np.int64)
 
 

@@ -26,7 +26,10 @@ def passing(feed: Feed, size) -> np.ndarray:
 
 def quantile(feed: Feed, fraction) -> np.ndarray:
     """Return the size in m that the mass fraction `fraction` (0 to 1, any shape) of the feed passes."""
-    fraction = np.asarray(fraction, dtype=float)
+    return np.minimum(_quantile(feed, np.asarray(fraction, dtype=float)), feed.coarsest)
+
+
+def _quantile(feed: Feed, fraction: np.ndarray) -> np.ndarray:
     if feed.kind == "uniform":
         return feed.bottom_size + (feed.top_size - feed.bottom_size) * fraction
     if feed.kind == "single":
@@ -35,7 +38,8 @@ def quantile(feed: Feed, fraction) -> np.ndarray:
         return feed.top_size * fraction ** (1 / feed.exponent)
     if feed.kind == "rosin_rammler":
         scaled = fraction * _rosin_rammler(feed, feed.top_size)
-        return feed.size * (-np.log1p(-scaled)) ** (1 / feed.exponent)
+        with np.errstate(divide="ignore"):  # far below the top all of it passes: inf, held at top_size
+            return feed.size * (-np.log1p(-scaled)) ** (1 / feed.exponent)
     log_size, table = _table(feed)
     if feed.top_size is not None:
         fraction = fraction * _scalped(feed)

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 
 BLOCK = 16  # cells; 8, 16 and 32 differ by less than 10 % on the paper's scene (benchmarks/kernel.py)
-DENSE = 1 / 16  # swap probability of an edge from which deciding every cell is cheaper than skipping
+DENSE = 1 / 64  # swap probability of an edge from which deciding every cell is cheaper than skipping
 SMALLEST = 1e-30  # m; a fragment is never 0 nor denormal in float32, and counted as below the size floor
 
 _MARGIN = 1.0 + 1e-6  # covers the rounding of a reach to float32, 6e-8, and of its exponential
@@ -144,7 +144,7 @@ def crush(
     trusted = reach_needed > 1e-200
     surely = reach_needed * (1.0 + 1e-9) if trusted else np.inf
     hardly = reach_needed * (1.0 - 1e-9) if trusted else 0.0
-    needed = np.float32(reach_needed)
+    needed = np.float32(min(reach_needed, 3e38))  # float32 ends there, beyond every reach
 
     # lists are filled without branches: a mispredicted one costs more than the test (196 -> 151 ns a cell)
     rows = reach.reshape(-1, BLOCK)
@@ -173,7 +173,7 @@ def crush(
         z = (size - mean) / (size + mean)
         zz = z * z
         low = 2.0 * z * (1.0 + zz * (1.0 / 3.0))
-        high = 2.0 * z * (1.0 + zz * (1.0 / 3.0 + zz / (5.0 * (1.0 - zz))))
+        high = 2.0 * z * (1.0 + zz * (1.0 / 3.0 + zz / (5.0 * max(1.0 - zz, 1e-300))))
         y = stiff * (low * low)
         most = ratio / (1.0 + y * (1.0 + y * (0.5 + y * (1.0 / 6.0))))
         y = stiff * (high * high)
@@ -359,8 +359,8 @@ def _swap_densely(below, above, streams_below, streams_above, state, rise, mixin
 
 @njit(cache=True, nogil=True)
 def swap(
-    sizes, streams, reach, block_reach, stale, largest, slots, crushing, pairs, rise, mixing, every, means,
-    number, key, inverse_unit, size_floor,
+    sizes, streams, reach, block_reach, stale, largest, slots, crushing, pairs, rise, mixing, passes, most_passes,
+    means, number, key, inverse_unit, size_floor,
 ):  # fmt: skip
     """Pass once over the edges and swap cells of equal index across each; return the number of swaps.
 
@@ -383,8 +383,8 @@ def swap(
         Points below and above each edge.
     rise, mixing : float64 (edge,)
         Probabilities of a swap by segregation, per m, and by mixing, in a pass.
-    every : int64 (edge,)
-        An edge takes part in each `every`-th pass.
+    passes, most_passes : int64 (edge,), int
+        In how many of the time step's passes each edge takes part, evenly spread, and the number of all.
     means : float64 (number of points,)
         Mean size of each parcel, m, held during the time step.
     number, key : int, uint64
@@ -395,7 +395,7 @@ def swap(
     cells = sizes.shape[1]
     swaps = 0
     for e in range(pairs.shape[0]):
-        if number % every[e]:
+        if (number + 1) * passes[e] // most_passes == number * passes[e] // most_passes:
             continue
         lower, upper = slots[pairs[e, 0]], slots[pairs[e, 1]]
         mean_below, mean_above = means[pairs[e, 0]], means[pairs[e, 1]]

@@ -116,6 +116,6 @@ class Lattice:
             key = np.uint64(kernels.mix(np.uint64((self._swap_key + counter * 0xD1342543DE82EF95) % 2**64)))
             self.swaps += kernels.swap(
                 self.sizes, self.streams, self._reach, self._block_reach, self._stale, self._largest, slots, crushing,
-                rates.pairs, rates.rise / passes, mixing / passes, most // passes, means, number, key,
+                rates.pairs, rates.rise / passes, mixing / passes, passes, most, means, number, key,
                 *self._size_scale,
             )  # fmt: skip

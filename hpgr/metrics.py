@@ -46,9 +46,10 @@ def passing(dataset: xr.Dataset, sieves=None, point: int = -1, total: bool = Fal
     _require_sizes(dataset)
     if "size" in dataset:
         wanted = dataset["sieve"].values if sieves is None else np.atleast_1d(np.asarray(sieves, dtype=float))
-        rows = _pooled_cells(dataset, point)
-        counts = np.stack([np.searchsorted(row, wanted, side="right") for row in rows])
-        found = xr.DataArray(counts / rows.shape[1], dims=("streamline", "sieve"), coords={"sieve": wanted})
+        as_cells = wanted.astype(np.float32)  # a grain of just a sieve's size passes it
+        found = _over_cells(
+            lambda row: np.searchsorted(row, as_cells, side="right") / row.size, dataset, point, ("sieve",)
+        ).assign_coords(sieve=wanted)
     else:
         found = _recorded_passing(dataset, point)
         if sieves is not None:
@@ -82,13 +83,11 @@ def percentile_size(dataset: xr.Dataset, percent: float, point: int = -1, total:
     if _is_exit(dataset, point) and name in dataset:
         return dataset[name]
     if "size" in dataset:
-        rows = _pooled_cells(dataset, point)
-        found = np.quantile(rows, percent / 100, axis=None if total else 1)
-        result = xr.DataArray(found, dims=() if total else ("streamline",))
+        result = _over_cells(lambda row: np.quantile(row, percent / 100), dataset, point, total=total)
     else:
         result = _percentile_between_sieves(_recorded_passing(dataset, point), percent / 100, total)
     result.attrs = {"units": "m", "long_name": f"size that {percent:g} % of the mass passes"}
-    return result
+    return result.rename(name)
 
 
 def throughput(dataset: xr.Dataset, total: bool = False) -> xr.DataArray:
@@ -147,10 +146,16 @@ def _is_exit(dataset: xr.Dataset, point: int) -> bool:
     return point in (-1, dataset.sizes.get("point", 0) - 1)
 
 
-def _pooled_cells(dataset: xr.Dataset, point: int) -> np.ndarray:
-    """Return the sizes at a point, (streamline, time x cell), sorted."""
-    sizes = _steady(dataset["size"]).isel(point=point).transpose("streamline", "time", "cell").values
-    return np.sort(sizes.reshape(sizes.shape[0], -1), axis=1)
+def _over_cells(function, dataset: xr.Dataset, point: int, new_dims=(), total: bool = False) -> xr.DataArray:
+    """Apply `function` to the sorted cells of a point, photographs pooled, for each streamline or for all."""
+    pooled = ("streamline", "time", "cell") if total else ("time", "cell")
+    return xr.apply_ufunc(
+        lambda cells: function(np.sort(cells, axis=None)),
+        _steady(dataset["size"]).isel(point=point, drop=True),
+        input_core_dims=[pooled],
+        output_core_dims=[new_dims],
+        vectorize=True,
+    )
 
 
 def _recorded_passing(dataset: xr.Dataset, point: int) -> xr.DataArray:
@@ -199,6 +204,9 @@ def _percentile_between_sieves(found: xr.DataArray, fraction: float, total: bool
                 f"percent: got {fraction:.0%}; the recorded sieves pass {fractions[0]:.3%} to {fractions[-1]:.3%}; "
                 "extend resolution.sieves, or record 'cells'"
             )
-        return np.exp(np.interp(fraction, fractions, log_sieves))
+        first = int(np.searchsorted(fractions, fraction))  # the finest sieve that passes it
+        if first == 0 or fractions[first] == fraction:
+            return np.exp(log_sieves[first])
+        return np.exp(np.interp(fraction, fractions[first - 1 : first + 1], log_sieves[first - 1 : first + 1]))
 
     return xr.apply_ufunc(invert, found, input_core_dims=[["sieve"]], vectorize=True)

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from hpgr import __version__, budget, exchange, flow, geometry, metrics, schema, solve, stress, tessellation
+from hpgr.keys import refuse_key
 from hpgr.scene import Scene
 
 _NIPPING = 1.5  # top size over gap above which rolls nip single grains, which is not modelled
@@ -36,7 +37,8 @@ def simulate(scene: Scene, seed: int = 0, replicate: int = 0) -> xr.Dataset:
     Raises
     ------
     ValueError
-        If the seed or replicate is not a whole number of at least 0, or material points coincide.
+        If the seed or replicate is not a whole number from 0 to 2**63 - 1, if material points coincide, or if
+        exchange would need absurdly many passes.
     MemoryError
         If the scene does not fit this machine's memory; the message has the predicted bytes.
 
@@ -48,9 +50,8 @@ def simulate(scene: Scene, seed: int = 0, replicate: int = 0) -> xr.Dataset:
     >>> dict(dataset["size"].sizes)
     {'time': 1, 'streamline': 10, 'point': 50, 'cell': 200}
     """
-    for name, value in {"seed": seed, "replicate": replicate}.items():
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
-            raise ValueError(f"{name}: got {value!r}; must be a whole number of at least 0; such as {name}=0")
+    refuse_key("seed", seed)
+    refuse_key("replicate", replicate)
     budget.refuse_too_large(scene)
     points, substeps = scene.resolution.points, scene.stress.substeps
     bed = geometry.bed(scene.rolls, scene.resolution.streamlines)
@@ -58,6 +59,7 @@ def simulate(scene: Scene, seed: int = 0, replicate: int = 0) -> xr.Dataset:
     state = stress.load(scene, fine)
     crushing = stress.crushing_stress(scene, fine, state)
     motion, state, crushing = (_every(substeps, part) for part in (fine, state, crushing))
+    motion = motion._replace(time_step=substeps * fine.time_step)
     cells = rates = None
     if solve.choose(scene) == "lattice":
         cells = tessellation.tessellate(scene, bed, motion)
@@ -71,13 +73,15 @@ def simulate(scene: Scene, seed: int = 0, replicate: int = 0) -> xr.Dataset:
 
 
 def _every(step: int, part: Any) -> Any:
-    """Return every step-th point of the (streamline, point) arrays within `part`."""
+    """Return every step-th point of the arrays within `part` that run over points."""
     if isinstance(part, np.ndarray):
-        return part[..., ::step] if step > 1 else part
-    if step == 1:
-        return part
-    wanted = {name: value[..., ::step] for name, value in part._asdict().items() if np.ndim(value) == 2}
-    return part._replace(**wanted)
+        return part[..., ::step]
+    over_points = {
+        name: value[..., ::step]
+        for name, value in part._asdict().items()
+        if np.ndim(value) == 2 or name == "residence_time"
+    }
+    return part._replace(**over_points)
 
 
 def _fields(bed: geometry.Geometry, motion: flow.Motion, state: stress.Load) -> dict[str, Any]:

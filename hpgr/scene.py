@@ -58,9 +58,13 @@ def _number(value: Any, unit: str) -> float:
             raise PydanticCustomError("text", "{reason}", {"reason": str(error)}) from None
     if isinstance(value, bool) or not isinstance(value, numbers.Real):
         raise PydanticCustomError("number", "must be a number in {unit}", {"unit": unit})
+    try:
+        value = float(value)
+    except OverflowError:
+        raise PydanticCustomError("number", "must be a number that fits double precision") from None
     if math.isnan(value):
         raise PydanticCustomError("nan", "must not be NaN")
-    return float(value)
+    return value
 
 
 def _integer(value: Any) -> int:
@@ -207,7 +211,11 @@ def _explained(cls: type[_Frozen], error: Any) -> InitErrorDetails:
         extra.get("remedy", "see the field's description"),
         error["input"],
     )
-    text = units.show(value, unit) if isinstance(value, float | int) and not isinstance(value, bool) else repr(value)
+    plain = isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) < 1e300)
+    in_table = location[:1] == ("table",)
+    text = units.show(value, unit) if plain and not in_table else repr(value)
+    if in_table and len(location) > 1:
+        text = f"{text} in row {location[1] + 1}"
     if kind == "extra_forbidden":
         text, bound = "an unknown field", "it does nothing here"
         close = difflib.get_close_matches(str(location[-1]), cls.model_fields, n=1)
@@ -398,7 +406,9 @@ class Feed(_Frozen):
         """Size of the largest grain in m."""
         if self.top_size is not None:
             return self.top_size
-        return self.size if self.table is None else self.table[-1][0]
+        if self.table is None:
+            return self.size
+        return next(size for size, percent in self.table if percent >= 100)
 
     @classmethod
     def _impossible(cls, known: dict[str, Any]) -> Iterator[Fault]:
@@ -452,9 +462,10 @@ def _table_faults(table: tuple[tuple[float, float], ...], top_size: float | None
             yield Fault("table", f"row 1 ({units.show(size, 'm')}, {percent:g} %)",
                         "its slope extended below it reaches 0 % only under 1 nm",
                         "add a finer row with 0 % passing")  # fmt: skip
-    if top_size is not None and not table[0][0] < top_size <= table[-1][0]:
+    empty = max((size for size, percent in table if percent <= 0), default=table[0][0])
+    if top_size is not None and not empty < top_size <= table[-1][0]:
         yield Fault("top_size", units.show(top_size, "m"),
-                    f"must lie within the table, {units.show(table[0][0], 'm')} to {units.show(table[-1][0], 'm')}",
+                    f"must lie within the table, above {units.show(empty, 'm')} to {units.show(table[-1][0], 'm')}",
                     "scalping only removes coarse grains")  # fmt: skip
 
 
@@ -600,8 +611,9 @@ class Scene(_Frozen):
                             f"must be at most the entry gap rolls.entry_gap {units.show(entry_gap, 'm')}",
                             "crush or scalp the feed first, or begin the bed higher")  # fmt: skip
         table, top_size = known.get("feed.table"), known.get("feed.top_size")
-        if table and entry_gap is not None and top_size is None and table[-1][0] > entry_gap:
-            yield Fault("feed.table", f"coarsest sieve {units.show(table[-1][0], 'm')}",
+        coarsest = next((size for size, percent in table or () if percent >= 100), 0.0)
+        if entry_gap is not None and top_size is None and coarsest > entry_gap:
+            yield Fault("feed.table", f"coarsest grain {units.show(coarsest, 'm')}",
                         f"must be at most the entry gap rolls.entry_gap {units.show(entry_gap, 'm')}",
                         "scalp it with feed.top_size, or begin the bed higher")  # fmt: skip
 

@@ -19,6 +19,8 @@ _POINT = ("streamline", "point")
 
 COORDINATES = {
     "time": Variable(("time",), "1", "number of the photograph", np.int32),
+    "elapsed_time": Variable(("time",), "s", "time of the photograph since the machine was filled", np.float64),
+    "steady": Variable(("time",), "1", "whether the photograph was taken after one residence time", np.int8),
     "xi": Variable(
         ("streamline",), "1", "distance from the mid-plane over that of the outermost streamline", np.float64
     ),

@@ -144,7 +144,7 @@ def _march(scene: Scene, log_stress: np.ndarray, seed: int, replicate: int) -> C
     shape = (grid.photographs, *log_stress.shape)
     product = np.empty((*shape[:2], grid.cells), np.float32)
     size = np.empty((*shape, grid.cells), np.float32) if grid.record == "cells" else None
-    sieves = np.array(grid.sieves) if grid.record == "distributions" else _NO_SIEVES
+    sieves = _cell_sieves(scene) if grid.record == "distributions" else _NO_SIEVES
     classes = np.empty((*shape, sieves.size + 1), np.int64) if sieves.size else None
     breaks = np.zeros(shape[1])
     reach_needed = parcels.reach_needed(scene, log_stress)
@@ -170,7 +170,7 @@ def _run_lattice(scene, log_stress, time_step, rates, seed, replicate) -> Crushe
     shape = (len(steps), *log_stress.shape)
     product = np.empty((len(steady), shape[1], grid.cells), np.float32)
     size = np.empty((*shape, grid.cells), np.float32) if grid.record == "cells" else None
-    sieves = np.array(grid.sieves)
+    sieves = _cell_sieves(scene)
     classes = np.empty((*shape, sieves.size + 1), np.int64) if grid.record == "distributions" else None
     breaks = np.zeros(shape[1])
     taken = 0
@@ -204,7 +204,7 @@ def _summarised(scene, product, breaks, size, classes) -> Crushed:
     return Crushed(
         breaks=breaks / pooled.shape[1],
         below_floor=_passing(pooled, [np.nextafter(scene.material.size_floor, 0.0)])[:, 0],
-        passing=_passing(pooled, grid.sieves),
+        passing=_passing(pooled, _cell_sieves(scene)),
         percentiles=np.quantile(pooled, FRACTIONS, axis=1),
         total_percentiles=np.quantile(pooled, FRACTIONS),
         size=size,
@@ -215,3 +215,8 @@ def _summarised(scene, product, breaks, size, classes) -> Crushed:
 def _passing(rows: np.ndarray, sieves) -> np.ndarray:
     """Return the fraction of each sorted row that is no larger than each sieve, (row, sieve)."""
     return np.stack([np.searchsorted(row, sieves, side="right") for row in rows]) / rows.shape[1]
+
+
+def _cell_sieves(scene: Scene) -> np.ndarray:
+    """Return the sieves rounded as the cells are, so that a grain of just a sieve's size passes it."""
+    return np.array(scene.resolution.sieves, np.float32).astype(float)

@@ -1,5 +1,6 @@
 """Text with a unit -> SI numbers, and SI numbers -> text in the unit people use."""
 
+import re
 from functools import cache
 
 # What a person reads, per SI unit: (unit shown, how many of it make one SI unit).
@@ -10,8 +11,14 @@ SHOWN = {
     "kg s-1": ("t/h", 3.6),
 }
 
-# pint's spelling of the CF-style units that fields and variables carry
-_PINT = {"rad s-1": "rad/s", "kg m-3": "kg/m^3", "m": "m", "Pa": "Pa", "1": ""}
+# pint's spelling of the CF-style units that fields carry
+_PINT = {"rad s-1": "rad/s", "kg m-3": "kg/m^3", "m": "m", "Pa": "Pa"}
+_EXAMPLES = {"rad s-1": "19 rpm", "kg m-3": "2.7 g/cm^3", "m": "60 mm", "Pa": "0.84 MPa"}
+
+# stricter than pint, which reads past what it does not understand ("60; mm") and sums up ("60 mm + 1 m")
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|[+-]?(?:nan|inf)(?=\s)"
+_QUANTITY = re.compile(rf"\s*({_NUMBER})\s*([a-zµμ][\w*/^.-]*)?\s*", re.IGNORECASE)
+_ANGLE = re.compile("rpm|rad|deg|rev|turn")  # pint takes 1 Hz for 1 rad/s
 
 
 @cache
@@ -27,19 +34,22 @@ def parse(text: str, unit: str) -> float:
     Raises
     ------
     ValueError
-        If the text is no number with a unit, or its unit has another dimension.
+        If the text is not one number and its unit, or the unit has another dimension.
     """
-    import pint
     from pint.errors import PintError
 
     shown = SHOWN.get(unit, (unit, 1.0))[0]
+    found = _QUANTITY.fullmatch(text)
+    if not found:
+        raise ValueError(f"not a number and a unit; write it like '{_EXAMPLES[unit]}'")
+    number, named = float(found[1]), (found[2] or "").strip()
+    if not named:
+        raise ValueError(f"text without a unit; write it as '{text.strip()} {shown}', or as a number in {unit}")
+    if unit == "rad s-1" and not _ANGLE.search(named):
+        raise ValueError("not a rate of turning; write it like '19 rpm' or '2 rad/s'")
     try:
-        quantity = _registry().Quantity(text)
-        bare = not isinstance(quantity, pint.Quantity) or quantity.dimensionless
-        if bare and unit != "1":
-            raise ValueError(f"text without a unit; write it as '{text.strip()} {shown}', or as a number in {unit}")
-        return float(quantity.to(_PINT[unit]).magnitude)
-    except (PintError, ArithmeticError, AttributeError, TypeError, AssertionError, SyntaxError) as error:
+        return float((number * _registry().Unit(named)).to(_PINT[unit]).magnitude)
+    except (PintError, ArithmeticError, AttributeError, TypeError, ValueError, AssertionError) as error:
         raise ValueError(f"not a quantity in {shown} ({type(error).__name__})") from None
 
 

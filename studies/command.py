@@ -10,7 +10,8 @@ import tyro
 from pydantic import ValidationError
 
 from hpgr import budget, presets, units
-from hpgr.scene import Scene, faults_of, field_info, field_value
+from hpgr.keys import refuse_key
+from hpgr.scene import Scene, faults_of, field_info
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -82,8 +83,7 @@ def run(study: Study, arguments: Sequence[str] | None = None) -> int:
             raise ValueError(
                 f"got --workers {options.workers} --replicates {options.replicates}; both must be at least 1"
             )
-        if options.seed < 0:
-            raise ValueError(f"got --seed {options.seed}; must be at least 0")
+        refuse_key("--seed", options.seed)
         if options.dry_run:
             _print_cases(scene, axes, options)
             return 0
@@ -100,7 +100,10 @@ def _base_scene(options: Options) -> Scene:
     if options.scene in presets.PRESETS:
         scene = presets.PRESETS[options.scene]()
     elif Path(options.scene).suffix in {".toml", ".json"}:
-        scene = Scene.from_file(options.scene)
+        try:
+            scene = Scene.from_file(options.scene)
+        except OSError as error:
+            raise ValueError(f"--scene: cannot read {options.scene!r}: {error.strerror}") from None
     else:
         raise ValueError(
             f"--scene: got {options.scene!r}; must be a preset ({', '.join(presets.PRESETS)}) or a .toml or .json file"
@@ -111,6 +114,8 @@ def _base_scene(options: Options) -> Scene:
 
 def _axes(study: Study, options: Options, scene: Scene) -> dict[str, list]:
     """Return the swept fields with their values, the study's own first."""
+    if scene.feed.kind == "single" and (study.main == "feed_top_size" or options.feed_top_size):
+        raise ValueError("--feed-top-size: the scene's feed is of a single size and has no top; sweep another feed")
     order = [study.main, *(name for name in AXES if name != study.main)]
     axes = {AXES[name]: list(getattr(options, name)) for name in order if getattr(options, name)}
     if not getattr(options, study.main):
@@ -126,11 +131,15 @@ def _default_values(study: Study, scene: Scene) -> list[float]:
     own = getattr(getattr(scene, section), key)
     if own is None and key == "top_size":
         own = scene.feed.coarsest
-    return [float(f"{own * factor:.3g}") for factor in study.factors]
+    return [own if factor == 1 else float(f"{own * factor:.3g}") for factor in study.factors]
 
 
 def _sieve(options: Options, scene: Scene) -> float:
-    sieve, known = field_value("rolls.gap", options.sieve), scene.resolution.sieves
+    known = scene.resolution.sieves
+    try:
+        sieve = units.parse(options.sieve, "m")
+    except ValueError as error:
+        raise ValueError(f"--sieve: got {options.sieve!r}; {error}") from None
     if not known[0] <= sieve <= known[-1]:
         raise ValueError(
             f"--sieve: got {options.sieve!r}; must lie within the scene's sieves, "
@@ -176,13 +185,19 @@ def _report(study: Study, options: Options, result: "xr.Dataset", sieve: float) 
     """Write the files, print the table, and return the exit code."""
     from studies import report, store
 
+    lost = report.lost_cases(result)
+    for line in lost:
+        print(line, file=sys.stderr)
+    if not report.any_result(result):
+        print("no case holds a result; nothing was written", file=sys.stderr)
+        return 1
     out = options.out or Path("outputs") / f"{study.name}.nc"
     if out.suffix != ".nc":
         out = out.with_name(out.name + ".nc")
     try:
         store.write_dataset(result, out)
         written = [out]
-        if options.plot and report.any_result(result):
+        if options.plot:
             from studies import plots
 
             figure = plots.sweep_figure(result, AXES[study.main], sieve, study.caption)
@@ -194,9 +209,6 @@ def _report(study: Study, options: Options, result: "xr.Dataset", sieve: float) 
     for line in (*report.notes(result), study.caption):
         print(line)
     print("wrote " + " and ".join(map(str, written)))
-    lost = report.lost_cases(result)
-    for line in lost:
-        print(line, file=sys.stderr)
     return 1 if lost else 0
 
 

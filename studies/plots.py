@@ -42,10 +42,10 @@ def sweep_figure(result: xr.Dataset, field: str, sieve: float, caption: str) -> 
         thinned = fineness_across_gap(panels[0, 0], panels[0, 1], result, sieve)
         product_sizes(panels[0, 2], result)
     for panel, heading in zip(panels[-1], headings, strict=True):
-        against_axis(panel, values[heading], result[axis], heading)
+        thinned |= against_axis(panel, values[heading], result[axis], heading)
     words = [caption] if caption else []
     if thinned:
-        words.append("Upper row: some of the operating points, evenly chosen.")
+        words.append(f"Panels show at most {_MOST_LINES} of the operating points, evenly chosen.")
     if result.sizes["replicate"] > 1:
         words.append(f"Mean of {result.sizes['replicate']} replicates; bars: ± one standard deviation.")
     note = Scene.model_validate_json(result.attrs["scene"]).note
@@ -94,13 +94,15 @@ def product_sizes(panel, result: xr.Dataset) -> None:
     panel.grid(color="0.9", which="both")
 
 
-def against_axis(panel, values: xr.DataArray, axis: xr.DataArray, heading: str) -> None:
-    """Draw one of the study's figures against the swept axis, a line per value of the other axes."""
+def against_axis(panel, values: xr.DataArray, axis: xr.DataArray, heading: str) -> bool:
+    """Draw a figure against the swept axis, a line per value of the other axes; return whether some were left out."""
     others = [name for name in values.dims if name not in (axis.name, "replicate")]
     lines = values.stack(line=others, create_index=False) if others else values.expand_dims("line")
     shown = report.shown_values(axis)
     numeric = axis.dtype.kind in "fiu"
     order = np.argsort(shown) if numeric else np.arange(shown.size)
+    total = lines.sizes["line"]
+    lines = lines.isel(line=_thinned(np.arange(total)))
     for k in range(lines.sizes["line"]):
         one = lines.isel(line=k).transpose(axis.name, "replicate")
         bars = report.spread(one).values
@@ -115,18 +117,25 @@ def against_axis(panel, values: xr.DataArray, axis: xr.DataArray, heading: str) 
             panel.set_ylim(0.8 * low, 1.2 * high)
     panel.ticklabel_format(axis="y", useOffset=False)
     panel.grid(color="0.9")
-    if others and lines.sizes["line"] <= _MOST_LINES:
+    if others:
         panel.legend(fontsize=8, title=_joined(others))
+    return lines.sizes["line"] < total
 
 
 def _shown_points(result: xr.Dataset) -> tuple[xr.Dataset, list[str], bool]:
     """Return the operating points that hold a result, at most a handful, with labels."""
     points = report.operating_points(result)
     held = np.flatnonzero(points["p80_total"].notnull().any("replicate").values)
-    chosen = held[np.unique(np.linspace(0, held.size - 1, min(held.size, _MOST_LINES)).round().astype(int))]
+    chosen = _thinned(held)
     axes = report.axes_of(result)
     labels = [", ".join(_value(points[name].values[k], result[name]) for name in axes) for k in chosen]
     return points.isel(operating_point=chosen), labels, chosen.size < held.size
+
+
+def _thinned(numbers: np.ndarray) -> np.ndarray:
+    """Return at most a handful of the numbers, evenly chosen."""
+    places = np.linspace(0, numbers.size - 1, min(numbers.size, _MOST_LINES)).round().astype(int)
+    return numbers[np.unique(places)]
 
 
 def _joined(names: list[str]) -> str:

@@ -18,7 +18,14 @@ def write_dataset(dataset: xr.Dataset, path: str | Path) -> None:
         If it cannot be written; a file that stood at `path` before is left as it was.
     """
     encoding = {name: _encoding(variable) for name, variable in dataset.variables.items()}
-    replace(path, lambda part: dataset.to_netcdf(part, engine="netcdf4", format="NETCDF4", encoding=encoding))
+
+    def write(part: Path) -> None:
+        try:
+            dataset.to_netcdf(part, engine="netcdf4", format="NETCDF4", encoding=encoding)
+        except RuntimeError as error:  # how the library tells of a full disk
+            raise OSError(f"{path}: {error}") from error
+
+    replace(path, write)
 
 
 def replace(path: str | Path, write: Callable[[Path], object]) -> None:

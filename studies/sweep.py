@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import ValidationError
 
 import hpgr
+from hpgr.keys import refuse_key
 from hpgr.scene import Scene, faults_of, field_info, field_value
 
 if TYPE_CHECKING:
@@ -95,6 +96,7 @@ def sweep(
     {'gap': 2, 'replicate': 2}
     """
     grid = axis_values(axes)
+    refuse_key("seed", seed)
     if replicates < 1:
         raise ValueError(f"replicates: got {replicates}; must be at least 1; such as replicates=3")
     base = scene.with_values({"resolution.record": "product"})
@@ -111,7 +113,7 @@ def axis_values(axes: Mapping[str, Iterable]) -> dict[str, list]:
     ValueError
         Naming the axis, the value and the remedy.
     """
-    grid = {name: [field_value(name, value) for value in values] for name, values in axes.items()}
+    grid = {name: [_axis_value(name, value) for value in _listed(name, values)] for name, values in axes.items()}
     for name, values in grid.items():
         if not values:
             raise ValueError(f"{name}: got no values; an axis needs at least one; give values or leave the axis out")
@@ -119,6 +121,19 @@ def axis_values(axes: Mapping[str, Iterable]) -> dict[str, list]:
         if double is not None:
             raise ValueError(f"{name}: got {double!r} twice; values must differ; use replicates to repeat a case")
     return grid
+
+
+def _listed(name: str, values: Any) -> list:
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise ValueError(f"{name}: got {values!r}; an axis is a list of values; such as [{values!r}]")
+    return list(values)
+
+
+def _axis_value(name: str, value: Any) -> Any:
+    found = field_value(name, value)
+    if not isinstance(found, int | float | str):
+        raise ValueError(f"{name}: got {value!r}; an axis takes numbers or words, no lists; sweep one scene for each")
+    return found
 
 
 def enumerate_cases(grid: Mapping[str, list], replicates: int) -> Iterator[Case]:
@@ -248,7 +263,8 @@ def _assemble(base, grid, replicates, seed, outcomes) -> "xr.Dataset":
         if name in uneven:
             continue
         if name in schema.COORDINATES:  # the same for every case that has one
-            first = stack[tuple(np.argwhere(status == STATUS["ok"])[0])]
+            first = stack.reshape(-1, *stack.shape[len(shape) :])
+            first = first[np.isfinite(first).all(axis=1)][0]
             dataset.coords[name] = (own_dims, first, schema.attributes(name))
         else:
             dataset[name] = ((*dims, *own_dims), stack, schema.attributes(name))

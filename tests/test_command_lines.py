@@ -306,9 +306,9 @@ def test_no_result_at_all(run, folder):
 def test_feed_of_one_size_has_no_top_size(run, folder):
     (folder / "single.toml").write_text(SINGLE)
     code, _, err = run("--scene", "single.toml", study=feed_sweep)
-    assert code != 0
-    assert "feed.top_size" in err
-    assert "a single feed has no such field" in err
+    assert code == 2
+    assert "--feed-top-size" in err
+    assert "of a single size" in err
     assert run("--scene", "single.toml", "--no-plot", study=gap_sweep)[0] == 0
 
 
@@ -327,7 +327,7 @@ def test_feed_of_one_size_has_no_top_size(run, folder):
         (["--scene", "gone.json"], ["gone.json"]),
         (["--workers", "0"], ["--workers", "0", "at least 1"]),
         (["--replicates", "0"], ["--replicates", "0", "at least 1"]),
-        (["--seed", "-1"], ["--seed", "-1", "at least 0"]),
+        (["--seed", "-1"], ["--seed", "-1", "from 0"]),
         (["--sieve", "3 m"], ["--sieve", "'3 m'", "1000 mm"]),
         (["--sieve", "1 nm"], ["--sieve", "'1 nm'", "0.001 mm"]),
         (["--sieve", "1"], ["--sieve", "without a unit"]),

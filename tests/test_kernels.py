@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 from support import (
-    COMPILED,
     KS,
     SIGMAS,
     critical_log_stress,
@@ -24,8 +23,6 @@ INF = math.inf
 GOLDEN = 0x9E3779B97F4A7C15
 MASK = 2**64 - 1
 
-
-narrow = pytest.mark.xfail(not COMPILED, reason="the float32 of a reach needed above 3.4e38 warns of overflow")
 
 # --- the plain reference -----------------------------------------------------------------------------------
 
@@ -78,9 +75,7 @@ def test_march_is_the_plain_reference_bit_for_bit(n, w, gamma, cells):
         assert same(sizes, states, history, n=n, w=w, gamma=gamma)
 
 
-@pytest.mark.parametrize(
-    "w", [0.05, 1.0, 60.0, 100.0, 300.0, *(pytest.param(w, marks=narrow) for w in (700.0, 1e4)), 1e8]
-)
+@pytest.mark.parametrize("w", [0.05, 1.0, 60.0, 100.0, 300.0, 700.0, 1e4, 1e8])
 def test_march_is_the_plain_reference_for_every_weibull_modulus(w):
     """Towards w = inf, exp(-strength w / 3) leaves the range of float32, then of float64."""
     sizes, states = line(200, seed=1)

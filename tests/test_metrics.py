@@ -100,7 +100,6 @@ def test_other_percentiles_are_interpolated_between_sieves(cells, distributions,
         assert float(passing(ds, [total], total=True)[0]) == pytest.approx(percent / 100, abs=1e-6)
 
 
-@pytest.mark.xfail(reason="np.interp takes the last of equal passings")
 def test_100_percent_pass_the_finest_sieve_that_passes_all(product):
     found = percentile_size(product, 100).values
     sieves = product["sieve"].values
@@ -201,7 +200,6 @@ def test_extra_dims_of_a_study_are_kept():
     assert percentile_size(swept, 80, total=True).dims == ("gap",)
 
 
-@pytest.mark.xfail(reason="pooling of cells knows no further dims")
 def test_extra_dims_are_kept_with_recorded_cells_too():
     import xarray as xr
 

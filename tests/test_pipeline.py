@@ -67,11 +67,10 @@ def test_photographs_are_independent():
 @pytest.mark.parametrize("name", ["seed", "replicate"])
 @pytest.mark.parametrize("value", [-1, 1.0, True, None, "1", np.float64(2)])
 def test_bad_seeds_are_refused(name, value):
-    with pytest.raises(ValueError, match=f"{name}: got .*; must be a whole number of at least 0; such as {name}=0"):
+    with pytest.raises(ValueError, match=f"{name}: got .*; must be a whole number .*; such as {name}=0"):
         simulate(paper({"resolution.cells": 0}), **{name: value})
 
 
-@pytest.mark.xfail(reason="an attribute beyond 64 bits")
 def test_seeds_that_netcdf_cannot_hold_are_refused_or_written_as_text():
     try:
         ds = simulate(paper({"resolution.cells": 0}), seed=2**70)
@@ -360,7 +359,6 @@ def test_coinciding_points_are_refused():
         simulate(paper({"flow.entry_fraction": 1e-9, "resolution.points": 2001}))
 
 
-@pytest.mark.xfail(reason="float32(0.1) > 0.1")
 def test_single_feed_passes_the_sieve_of_its_own_size():
     """Cells are float32, and float32(0.1) > 0.1: the grain must still pass the 100 mm sieve."""
     for cushioning in (1.0, INF):
@@ -419,7 +417,6 @@ def test_several_photographs_in_every_record(cushioning, record):
 # --- substeps ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.xfail(reason="residence_time is not thinned")
 @pytest.mark.parametrize("values", [{}, EQUAL_GAPS], ids=["paper", "equal gaps"])
 def test_substeps_refine_the_stress_and_keep_the_points(values):
     """Strains of 61 points with 20 substeps are those of 1201 points."""
@@ -435,7 +432,6 @@ def test_substeps_refine_the_stress_and_keep_the_points(values):
     assert np.array_equal(refined["continuity_solid_fraction"], fine["continuity_solid_fraction"])
 
 
-@pytest.mark.xfail(reason="residence_time is not thinned")
 def test_crushing_takes_one_step_per_point_whatever_the_substeps():
     ds = simulate(paper({"stress.substeps": 5}))
     assert ds["size"].dims == ("time", "streamline", "point", "cell")

@@ -133,7 +133,7 @@ def test_caption_tells_replicates_and_note(swept):
 def test_many_points_are_thinned_and_it_says_so():
     gaps = np.linspace(0.03, 0.1, 11)
     figure = draw(sweep(paper(BASE), {"rolls.gap": gaps}))
-    assert "some of the operating points, evenly chosen" in figure.get_supxlabel()
+    assert "at most 7 of the operating points, evenly chosen" in figure.get_supxlabel()
     for panel in figure.axes[:3]:
         assert len(lines_of(panel)) == len(styles(panel)) == 7
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
