@@ -646,6 +646,8 @@ class Scene(_Frozen):
     def with_values(self, values: Mapping[str, Any]) -> Self:
         """Return the scene with other values, given by dotted name, validated as a whole.
 
+        A name without a dot replaces a whole part: ``{"exchange": None}``, ``{"exchange": {}}`` for its defaults.
+
         Examples
         --------
         >>> import hpgr
@@ -660,7 +662,7 @@ class Scene(_Frozen):
         data: dict[str, Any] = {name: dict(part) if isinstance(part, BaseModel) else part for name, part in self}
         for name, value in values.items():
             section, _, key = name.partition(".")
-            data[section] = (data.get(section) or {}) | {key: value}
+            data[section] = (data.get(section) or {}) | {key: value} if key else value
         return type(self).model_validate(data)
 
     def __repr__(self) -> str:

@@ -1,7 +1,8 @@
 """The command line that the sweeps over gap, speed and feed share."""
 
+import functools
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -27,9 +28,11 @@ class Study(NamedTuple):
     factors: tuple[float, ...]
     about: str
     caption: str
+    exchange_caption: str = ""
 
 
-def _shown_as(metavar: str):
+def shown_as(metavar: str):
+    """Return the word by which `--help` shows an option's value."""
     return tyro.conf.arg(metavar=metavar)
 
 
@@ -37,31 +40,33 @@ def _shown_as(metavar: str):
 class Options:
     """Options of a sweep; quantities are text with a unit, such as "60 mm" or "19 rpm"."""
 
-    gap: Annotated[tuple[str, ...], _shown_as("LENGTH ...")] = ()
+    gap: Annotated[tuple[str, ...], shown_as("LENGTH ...")] = ()
     """Gaps to sweep, such as --gap "40 mm" "60 mm"."""
-    roll_speed: Annotated[tuple[str, ...], _shown_as("SPEED ...")] = ()
+    roll_speed: Annotated[tuple[str, ...], shown_as("SPEED ...")] = ()
     """Roll speeds to sweep, such as --roll-speed "15 rpm" "19 rpm"."""
-    feed_top_size: Annotated[tuple[str, ...], _shown_as("LENGTH ...")] = ()
+    feed_top_size: Annotated[tuple[str, ...], shown_as("LENGTH ...")] = ()
     """Top sizes of the feed to sweep, such as --feed-top-size "40 mm" "60 mm"."""
-    scene: Annotated[str, _shown_as("PRESET|FILE")] = "paper"
+    scene: Annotated[str, shown_as("PRESET|FILE")] = "paper"
     """Base scene: a preset (paper, khd_pilot), or the path of a .toml or .json scene file."""
-    replicates: Annotated[int, _shown_as("N")] = 3
+    replicates: Annotated[int, shown_as("N")] = 3
     """Independent repetitions of every operating point; they make the spread."""
-    cells: Annotated[int | None, _shown_as("N")] = None
+    cells: Annotated[int | None, shown_as("N")] = None
     """Cells per material point (default: the scene's); 0 computes stress only."""
-    points: Annotated[int | None, _shown_as("N")] = None
+    points: Annotated[int | None, shown_as("N")] = None
     """Material points per streamline (default: the scene's)."""
-    streamlines: Annotated[int | None, _shown_as("N")] = None
+    streamlines: Annotated[int | None, shown_as("N")] = None
     """Streamlines from the mid-plane to the roll (default: the scene's)."""
-    sieve: Annotated[str, _shown_as("LENGTH")] = "1 mm"
+    sieve: Annotated[str, shown_as("LENGTH")] = "1 mm"
     """Sieve whose percent passing is shown."""
-    workers: Annotated[int, _shown_as("N")] = 2
+    workers: Annotated[int, shown_as("N")] = 2
     """Threads of this process to run cases on; without effect beside --scheduler."""
-    scheduler: Annotated[str | None, _shown_as("ADDRESS")] = None
+    scheduler: Annotated[str | None, shown_as("ADDRESS")] = None
     """Running dask scheduler to use instead, such as tcp://127.0.0.1:8786."""
-    seed: Annotated[int, _shown_as("N")] = 0
+    exchange: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Switch on segregation and mixing between streamlines, if the scene does not say how with their defaults."""
+    seed: Annotated[int, shown_as("N")] = 0
     """Seed of all randomness; the same seed gives the same bits."""
-    out: Annotated[Path | None, _shown_as("FILE")] = None
+    out: Annotated[Path | None, shown_as("FILE")] = None
     """NetCDF file to write (default: outputs/<study>.nc); the figure goes beside it as .png."""
     plot: bool = True
     """Draw the figure, or not."""
@@ -69,47 +74,67 @@ class Options:
     """List the cases with their predicted memory and time, and run none."""
 
 
+def refusing(command: Callable[..., int]) -> Callable[..., int]:
+    """Make a command print what it refuses as one clear error, and return exit code 2."""
+
+    @functools.wraps(command)
+    def wrapped(*args, **kwargs) -> int:
+        try:
+            return command(*args, **kwargs)
+        except ValidationError as error:
+            message = "the scene is refused:\n  " + faults_of(error, separator="\n  ")
+        except (OSError, ValueError, MemoryError) as error:
+            message = str(error)
+        print(f"error: {message}", file=sys.stderr)
+        return 2
+
+    return wrapped
+
+
+@refusing
 def run(study: Study, arguments: Sequence[str] | None = None) -> int:
     """Run a study from the command line; return its exit code.
 
-    0: every case is well. 1: some cases hold no result, named on standard error. 2: nothing was run.
+    0: every case is well. 1: some cases hold no result, named on standard error. 2: nothing was run or written.
     """
     options = tyro.cli(Options, prog=f"python -m studies.{study.name}", description=study.about, args=arguments)
-    try:
-        scene, axes = _base_scene(options), {}
-        axes = _axes(study, options, scene)
-        sieve = _sieve(options, scene)
-        if min(options.workers, options.replicates) < 1:
-            raise ValueError(
-                f"got --workers {options.workers} --replicates {options.replicates}; both must be at least 1"
-            )
-        refuse_key("--seed", options.seed)
-        if options.dry_run:
-            _print_cases(scene, axes, options)
-            return 0
-        result = _sweep(scene, axes, options)
-    except ValidationError as error:
-        return _refuse("the scene is refused:\n  " + faults_of(error, separator="\n  "))
-    except (OSError, ValueError, MemoryError) as error:
-        return _refuse(str(error))
+    chosen = {name: getattr(options, name) for name in ("cells", "points", "streamlines")}
+    scene = base_scene(options.scene, **{name: value for name, value in chosen.items() if value is not None})
+    if options.exchange and scene.exchange is None:
+        scene = scene.with_values({"exchange": {}})
+    axes = _axes(study, options, scene)
+    sieve = _sieve(options, scene)
+    if min(options.workers, options.replicates) < 1:
+        raise ValueError(f"got --workers {options.workers} --replicates {options.replicates}; both must be at least 1")
+    refuse_key("--seed", options.seed)
+    if options.dry_run:
+        _print_cases(scene, axes, options)
+        return 0
+    result = _sweep(scene, axes, options)
     result.attrs["history"] = _command_line(study, arguments)
     return _report(study, options, result, sieve)
 
 
-def _base_scene(options: Options) -> Scene:
-    if options.scene in presets.PRESETS:
-        scene = presets.PRESETS[options.scene]()
-    elif Path(options.scene).suffix in {".toml", ".json"}:
+def base_scene(name: str, **resolution: int) -> Scene:
+    """Return the scene of a preset or file, with another resolution.
+
+    Raises
+    ------
+    ValueError
+        If there is no such scene, or it is impossible.
+    """
+    if name in presets.PRESETS:
+        scene = presets.PRESETS[name]()
+    elif Path(name).suffix in {".toml", ".json"}:
         try:
-            scene = Scene.from_file(options.scene)
+            scene = Scene.from_file(name)
         except OSError as error:
-            raise ValueError(f"--scene: cannot read {options.scene!r}: {error.strerror}") from None
+            raise ValueError(f"--scene: cannot read {name!r}: {error.strerror}") from None
     else:
         raise ValueError(
-            f"--scene: got {options.scene!r}; must be a preset ({', '.join(presets.PRESETS)}) or a .toml or .json file"
+            f"--scene: got {name!r}; must be a preset ({', '.join(presets.PRESETS)}) or a .toml or .json file"
         )
-    given = {f"resolution.{name}": getattr(options, name) for name in ("cells", "points", "streamlines")}
-    return scene.with_values({name: value for name, value in given.items() if value is not None})
+    return scene.with_values({f"resolution.{key}": value for key, value in resolution.items()})
 
 
 def _axes(study: Study, options: Options, scene: Scene) -> dict[str, list]:
@@ -131,7 +156,8 @@ def _default_values(study: Study, scene: Scene) -> list[float]:
     own = getattr(getattr(scene, section), key)
     if own is None and key == "top_size":
         own = scene.feed.coarsest
-    return [own if factor == 1 else float(f"{own * factor:.3g}") for factor in study.factors]
+    shown = units.SHOWN[field_info(AXES[study.main]).unit][1]
+    return [own if factor == 1 else float(f"{own * factor * shown:.3g}") / shown for factor in study.factors]
 
 
 def _sieve(options: Options, scene: Scene) -> float:
@@ -191,25 +217,28 @@ def _report(study: Study, options: Options, result: "xr.Dataset", sieve: float) 
     if not report.any_result(result):
         print("no case holds a result; nothing was written", file=sys.stderr)
         return 1
+    sayings = [*report.change(result, AXES[study.main]), _caption(study, result)]
     out = options.out or Path("outputs") / f"{study.name}.nc"
     if out.suffix != ".nc":
         out = out.with_name(out.name + ".nc")
-    try:
-        store.write_dataset(result, out)
-        written = [out]
-        if options.plot:
-            from studies import plots
+    store.write_dataset(result, out)
+    written = [out]
+    if options.plot:
+        from studies import plots
 
-            figure = plots.sweep_figure(result, AXES[study.main], sieve, study.caption)
-            store.replace(out.with_suffix(".png"), lambda part: figure.savefig(part, dpi=150))
-            written.append(out.with_suffix(".png"))
-    except OSError as error:
-        return _refuse(f"could not write the result: {error}")
+        figure = plots.sweep_figure(result, AXES[study.main], sieve, "\n".join(sayings))
+        store.replace(out.with_suffix(".png"), lambda part: figure.savefig(part, dpi=150))
+        written.append(out.with_suffix(".png"))
     print(report.table(result, sieve))
-    for line in (*report.notes(result), study.caption):
+    for line in (*report.notes(result), *sayings):
         print(line)
     print("wrote " + " and ".join(map(str, written)))
     return 1 if lost else 0
+
+
+def _caption(study: Study, result: "xr.Dataset") -> str:
+    exchange = Scene.model_validate_json(result.attrs["scene"]).exchange
+    return study.caption if exchange is None or not study.exchange_caption else study.exchange_caption
 
 
 def _heading(name: str) -> str:
@@ -226,8 +255,3 @@ def _command_line(study: Study, arguments: Sequence[str] | None) -> str:
 
     given = sys.argv[1:] if arguments is None else arguments
     return f"python -m studies.{study.name} {shlex.join(given)}".strip()
-
-
-def _refuse(message: str) -> int:
-    print(f"error: {message}", file=sys.stderr)
-    return 2

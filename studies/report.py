@@ -90,6 +90,27 @@ def notes(result: xr.Dataset) -> list[str]:
     return lines
 
 
+def change(result: xr.Dataset, field: str) -> list[str]:
+    """Return a line on how much P80 changes from end to end of the axis of a scene field, if it can be told.
+
+    Replicates share their random numbers along an axis, so the change is that of pairs; other axes are averaged.
+    """
+    axis = next(value for value in result.coords.values() if value.attrs.get("scene_field") == field)
+    if "p80_total" not in result or axis.size < 2 or axis.dtype.kind not in "fiu":
+        return []
+    order = np.argsort(axis.values)
+    p80 = result["p80_total"].astype(float).isel({axis.name: order})
+    ratio = p80.isel({axis.name: -1}) / p80.isel({axis.name: 0}) - 1
+    ratio = 100 * ratio.mean([name for name in ratio.dims if name != "replicate"])
+    if not ratio.notnull().any():
+        return []
+    size = int(ratio.notnull().sum())
+    error = f" ± {float(ratio.std(ddof=1)) / np.sqrt(size):.2g}" if size > 1 else ""
+    ends = f"{_place(axis, order[0])} to {_place(axis, order[-1])}"
+    told = " (mean ± standard error of pairs)" if error else ""
+    return [f"P80 changes by {float(ratio.mean()):+.3g}{error} % from {ends}{told}."]
+
+
 def lost_cases(result: xr.Dataset) -> list[str]:
     """Return a line for every operating point that lost replicates: status, where, why."""
     words = {number: word for word, number in STATUS.items()}
