@@ -3,14 +3,14 @@
 Not simulate.py: importing a module of that name would replace the function `hpgr.simulate` by the module.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 
 from hpgr import __version__, budget, exchange, flow, geometry, metrics, schema, solve, stress, tessellation
 from hpgr.keys import refuse_key
-from hpgr.scene import Scene
+from hpgr.scene import LEVELS, Scene
 
 _NIPPING = 1.5  # top size over gap above which rolls nip single grains, which is not modelled
 
@@ -53,6 +53,61 @@ def simulate(scene: Scene, seed: int = 0, replicate: int = 0) -> xr.Dataset:
     refuse_key("seed", seed)
     refuse_key("replicate", replicate)
     budget.refuse_too_large(scene)
+    prepared = prepare(scene)
+    values = crush(scene, prepared, seed, replicate)
+    notes = values.pop("notes")
+    return schema.to_dataset(values, _attributes(scene, seed, replicate, prepared) | {"notes": notes})
+
+
+class Prepared(NamedTuple):
+    """The loaded bed of a scene, which scenes of the same `bed_key` share.
+
+    Attributes
+    ----------
+    bed : hpgr.geometry.Geometry
+        The bed.
+    motion : hpgr.flow.Motion
+        Material points and strain rates.
+    state : hpgr.stress.Load
+        Strains and stresses there.
+    crushing : ndarray
+        (streamline, point) stress that crushes, Pa.
+    volume : ndarray or None
+        (streamline, point) Voronoi volumes per roll width, m2, of a scene with exchange.
+    rates : hpgr.exchange.SwapRates or None
+        Swap rates of a scene with exchange.
+    """
+
+    bed: geometry.Geometry
+    motion: flow.Motion
+    state: stress.Load
+    crushing: np.ndarray
+    volume: np.ndarray | None
+    rates: exchange.SwapRates | None
+
+
+def bed_key(scene: Scene) -> tuple:
+    """Return all that `prepare` makes of a scene: scenes of equal keys share their bed."""
+    ore, grid = scene.material, scene.resolution
+    elastic = (
+        ore.bulk_modulus,
+        ore.shear_modulus,
+        ore.elastic_exponent,
+        ore.feed_solid_fraction,
+        ore.max_solid_fraction,
+    )
+    exchanging = scene.exchange if solve.choose(scene) == "lattice" else None
+    return scene.rolls, scene.flow, scene.stress, elastic, grid.streamlines, grid.points, exchanging
+
+
+def prepare(scene: Scene) -> Prepared:
+    """Return the loaded bed of `scene`: geometry, motion, stress, and swap rates if it has exchange.
+
+    Raises
+    ------
+    ValueError
+        If material points coincide.
+    """
     points, substeps = scene.resolution.points, scene.stress.substeps
     bed = geometry.bed(scene.rolls, scene.resolution.streamlines)
     fine = flow.move(scene, bed, (points - 1) * substeps + 1)
@@ -60,16 +115,26 @@ def simulate(scene: Scene, seed: int = 0, replicate: int = 0) -> xr.Dataset:
     crushing = stress.crushing_stress(scene, fine, state)
     motion, state, crushing = (_every(substeps, part) for part in (fine, state, crushing))
     motion = motion._replace(time_step=substeps * fine.time_step)
-    cells = rates = None
-    if solve.choose(scene) == "lattice":
-        cells = tessellation.tessellate(scene, bed, motion)
-        rates = exchange.swap_rates(scene, motion, state, cells)
-    crushed = solve.crush(scene, crushing, motion.time_step, rates, seed, replicate)
+    if solve.choose(scene) != "lattice":
+        return Prepared(bed, motion, state, crushing, None, None)
+    cells = tessellation.tessellate(scene, bed, motion)
+    return Prepared(bed, motion, state, crushing, cells.volume, exchange.swap_rates(scene, motion, state, cells))
+
+
+def crush(scene: Scene, prepared: Prepared, seed: int, replicate: int) -> dict[str, Any]:
+    """Crush the feed of `scene` in its prepared bed; return every variable of the Dataset by name, and `notes`.
+
+    Studies take their summaries from here: making a Dataset of every case would cost them as much as crushing.
+    """
+    bed, motion, state = prepared.bed, prepared.motion, prepared.state
+    crushed = solve.crush(scene, prepared.crushing, motion.time_step, prepared.rates, seed, replicate)
     values = _fields(bed, motion, state) | _summaries(scene, motion, state) | _product(scene, crushed)
-    values["volume"] = None if cells is None else cells.volume
     notes = _notes(scene, bed, state, crushed)
-    values["flags"] = sum(schema.FLAGS[name] for name in notes)
-    return schema.to_dataset(values, _attributes(scene, seed, replicate, bed, motion, notes))
+    return values | {
+        "volume": prepared.volume,
+        "flags": sum(schema.FLAGS[name] for name in notes),
+        "notes": "\n".join(f"{name}: {text}" for name, text in notes.items()),
+    }
 
 
 def _every(step: int, part: Any) -> Any:
@@ -176,8 +241,10 @@ def _notes(scene: Scene, bed: geometry.Geometry, state: stress.Load, crushed: so
     return notes
 
 
-def _attributes(scene, seed, replicate, bed, motion, notes) -> dict[str, Any]:
-    return {
+def _attributes(scene: Scene, seed: int, replicate: int, prepared: Prepared) -> dict[str, Any]:
+    level = scene.resolution.level
+    measured = {} if level == "custom" else {"level": f"{level}: {LEVELS[level].measured}"}
+    return measured | {
         "Conventions": "CF-1.11",
         "title": "Comminution in high pressure grinding rolls, heterarchical model",
         "source": f"hpgr {__version__}",
@@ -186,7 +253,6 @@ def _attributes(scene, seed, replicate, bed, motion, notes) -> dict[str, Any]:
         "seed": int(seed),
         "replicate": int(replicate),
         "solver": solve.choose(scene),
-        "time_step_s": motion.time_step,
-        "streamline_deviation_m": bed.deviation(),
-        "notes": "\n".join(f"{name}: {text}" for name, text in notes.items()),
+        "time_step_s": prepared.motion.time_step,
+        "streamline_deviation_m": prepared.bed.deviation(),
     }

@@ -529,9 +529,34 @@ def _default_sieves() -> tuple[float, ...]:
     return tuple(float(f"{10 ** (k / 10 - 6):.6g}") for k in range(61))
 
 
-class Resolution(_Frozen):
-    """How finely the scene is computed, and what is kept of it."""
+class Level(NamedTuple):
+    """A named resolution, and what it was measured to give on the paper's scene (docs/accuracy.md)."""
 
+    streamlines: int
+    points: int
+    cells: int
+    measured: str
+
+
+LEVELS = {
+    "draft": Level(5, 100, 200, "not measured yet"),
+    "standard": Level(10, 200, 1000, "not measured yet"),
+    "fine": Level(20, 800, 10_000, "not measured yet"),
+}
+
+
+_LEVEL_FIELDS = ("streamlines", "points", "cells")
+
+
+class Resolution(_Frozen):
+    """How finely the scene is computed, and what is kept of it.
+
+    `level` names a measured choice of streamlines, points and cells, which are then not given.
+    """
+
+    level: Literal["custom", "draft", "standard", "fine"] = Field(
+        "custom", description="Named resolution; 'custom' takes streamlines, points and cells as given"
+    )
     streamlines: Count = _field(
         "N",
         "1",
@@ -564,8 +589,21 @@ class Resolution(_Frozen):
         "give rising sizes, such as ['1 mm', '10 mm']", _default_sieves(), min_length=1, max_length=10_000,
     )  # fmt: skip
 
+    @model_validator(mode="before")
+    @classmethod
+    def _take_level(cls, data: Any) -> Any:
+        named = LEVELS.get(data.get("level")) if isinstance(data, Mapping) else None
+        if named is None:
+            return data
+        return {name: getattr(named, name) for name in _LEVEL_FIELDS} | dict(data)
+
     @classmethod
     def _impossible(cls, known: dict[str, Any]) -> Iterator[Fault]:
+        named = LEVELS.get(known.get("level", ""))
+        for name in _LEVEL_FIELDS if named else ():
+            if known.get(name) not in (None, getattr(named, name)):
+                yield Fault(name, str(known[name]), f"level {known['level']!r} has {getattr(named, name)}",
+                            f"leave {name} or the level out")  # fmt: skip
         sieves = known.get("sieves", ())
         for number, (finer, coarser) in enumerate(zip((0.0, *sieves), sieves, strict=False), start=1):
             if not finer < coarser:
@@ -660,6 +698,10 @@ class Scene(_Frozen):
             If a name is unknown, or the scene is impossible with these values.
         """
         data: dict[str, Any] = {name: dict(part) if isinstance(part, BaseModel) else part for name, part in self}
+        if "resolution.level" in values:
+            data["resolution"] = {k: v for k, v in data["resolution"].items() if k not in _LEVEL_FIELDS}
+        elif any(f"resolution.{name}" in values for name in _LEVEL_FIELDS):
+            data["resolution"]["level"] = "custom"
         for name, value in values.items():
             section, _, key = name.partition(".")
             data[section] = (data.get(section) or {}) | {key: value} if key else value

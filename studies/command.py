@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import tyro
 from pydantic import ValidationError
@@ -50,6 +50,8 @@ class Options:
     """Base scene: a preset (paper, khd_pilot), or the path of a .toml or .json scene file."""
     replicates: Annotated[int, shown_as("N")] = 3
     """Independent repetitions of every operating point; they make the spread."""
+    level: Annotated[Literal["draft", "standard", "fine"] | None, shown_as("draft|standard|fine")] = None
+    """Named resolution instead of the scene's, with measured error and cost (docs/accuracy.md)."""
     cells: Annotated[int | None, shown_as("N")] = None
     """Cells per material point (default: the scene's); 0 computes stress only."""
     points: Annotated[int | None, shown_as("N")] = None
@@ -98,7 +100,7 @@ def run(study: Study, arguments: Sequence[str] | None = None) -> int:
     0: every case is well. 1: some cases hold no result, named on standard error. 2: nothing was run or written.
     """
     options = tyro.cli(Options, prog=f"python -m studies.{study.name}", description=study.about, args=arguments)
-    chosen = {name: getattr(options, name) for name in ("cells", "points", "streamlines")}
+    chosen = {name: getattr(options, name) for name in ("level", "cells", "points", "streamlines")}
     scene = base_scene(options.scene, **{name: value for name, value in chosen.items() if value is not None})
     if options.exchange and scene.exchange is None:
         scene = scene.with_values({"exchange": {}})
@@ -115,7 +117,7 @@ def run(study: Study, arguments: Sequence[str] | None = None) -> int:
     return _report(study, options, result, sieve)
 
 
-def base_scene(name: str, **resolution: int) -> Scene:
+def base_scene(name: str, **resolution: int | str) -> Scene:
     """Return the scene of a preset or file, with another resolution.
 
     Raises
@@ -221,14 +223,17 @@ def _report(study: Study, options: Options, result: "xr.Dataset", sieve: float) 
     out = options.out or Path("outputs") / f"{study.name}.nc"
     if out.suffix != ".nc":
         out = out.with_name(out.name + ".nc")
-    store.write_dataset(result, out)
-    written = [out]
-    if options.plot:
-        from studies import plots
+    try:
+        store.write_dataset(result, out)
+        written = [out]
+        if options.plot:
+            from studies import plots
 
-        figure = plots.sweep_figure(result, AXES[study.main], sieve, "\n".join(sayings))
-        store.replace(out.with_suffix(".png"), lambda part: figure.savefig(part, dpi=150))
-        written.append(out.with_suffix(".png"))
+            figure = plots.sweep_figure(result, AXES[study.main], sieve, "\n".join(sayings))
+            store.replace(out.with_suffix(".png"), lambda part: figure.savefig(part, dpi=150))
+            written.append(out.with_suffix(".png"))
+    except OSError as error:
+        raise OSError(f"could not write the result: {error}") from error
     print(report.table(result, sieve))
     for line in (*report.notes(result), *sayings):
         print(line)

@@ -23,7 +23,7 @@ def write_dataset(dataset: xr.Dataset, path: str | Path) -> None:
         try:
             dataset.to_netcdf(part, engine="netcdf4", format="NETCDF4", encoding=encoding)
         except RuntimeError as error:  # how the library tells of a full disk
-            raise OSError(f"{path}: {error}") from error
+            raise OSError(error) from error
 
     replace(path, write)
 

@@ -1,0 +1,609 @@
+import math
+
+import numpy as np
+import pytest
+from scipy import linalg, special, stats
+from support import COMPILED, SIGMAS, paper, sized, streams
+
+from hpgr import exchange, flow, geometry, kernels, simulate, stress, tessellation
+from hpgr.exchange import SwapRates
+
+INF = math.inf
+
+
+def prepared(scene):
+    """What the pipeline hands to swap_rates."""
+    bed = geometry.bed(scene.rolls, scene.resolution.streamlines)
+    motion = flow.move(scene, bed, scene.resolution.points)
+    return motion, stress.load(scene, motion), tessellation.tessellate(scene, bed, motion)
+
+
+def mixed(values=None):
+    return paper({"exchange.segregation": 0.1, "exchange.mixing": 0.1} | (values or {}))
+
+
+# --- swap rates --------------------------------------------------------------------------------------------
+
+
+def one_edge(segregation, mixing):
+    """Two points 0.2 m apart, the edge 0.3 m long and tilted, in a stream tube of 5 mm."""
+    scene = paper(
+        {
+            "exchange.segregation": segregation,
+            "exchange.mixing": mixing,
+            "resolution.streamlines": 2,
+            "resolution.points": 2,
+            "rolls.gap": 0.02,
+            "rolls.diameter": 6.0,
+            "rolls.speed": 2.0,
+        }
+    )
+    zero = np.zeros((2, 2))
+    motion = flow.Motion(zero, zero, np.zeros(2), zero, zero, np.array([[4.0, 6.0], [0.0, 0.0]]), 0.01)
+    state = stress.load(paper({"resolution.streamlines": 2, "resolution.points": 2}), prepared(paper())[0])
+    state = state._replace(solid_fraction=np.array([[0.6, 0.8], [0.7, 0.9]]))
+    cells = tessellation.Tessellation(
+        zero, np.array([[1, 0]]), np.array([0.3]), np.array([[0.6, 0.8]]), np.array([0.2]), None, None
+    )
+    return exchange.swap_rates(scene, motion, state, cells)
+
+
+def test_rates_of_one_edge_by_hand():
+    """f dt = l dt gammadot phi A n_y / (m / rho_s) per m, and l dt gammadot phi B / (d m / rho_s) per m2.
+
+    Shear rate sqrt(3) (4 + 6) / 2 = 8.66 /s and solid fraction 0.7 at the edge; tube 0.02 / 4 = 5 mm at the
+    exit, roll surface 2 x 3 = 6 m/s, solid fraction (0.8 + 0.9) / 2 there: m / rho_s = 0.005 x 6 x 0.01 x 0.85.
+    """
+    found = one_edge(0.1, 0.2)
+    sheared = 0.3 * math.sqrt(3) * 5 * 0.01 * 0.7
+    parcel = 0.005 * 6 * 0.01 * 0.85
+    assert found.rise == pytest.approx([0.1 * sheared * 0.8 / parcel], rel=1e-12)
+    assert found.mixing == pytest.approx([0.2 * sheared / (0.2 * parcel)], rel=1e-12)
+    assert found.pairs.tolist() == [[1, 0]]
+
+
+def test_rates_are_proportional_to_their_coefficient_and_know_no_other():
+    plain, more = one_edge(0.1, 0.2), one_edge(0.4, 1.6)
+    assert more.rise == pytest.approx(4 * plain.rise, rel=1e-12)
+    assert more.mixing == pytest.approx(8 * plain.mixing, rel=1e-12)
+    assert one_edge(0.0, 0.2).rise == 0
+    assert one_edge(0.1, 0.0).mixing == 0
+    assert one_edge(0.0, 0.2).mixing == plain.mixing
+    assert one_edge(0.1, 0.0).rise == plain.rise
+
+
+def test_rates_are_never_negative():
+    for gap in (1e-6, 0.06, 1.0):
+        scene = mixed({"rolls.gap": gap, "rolls.entry_gap": gap + 1.08})
+        found = exchange.swap_rates(scene, *prepared(scene))
+        for rate in (found.rise, found.mixing):
+            assert np.isfinite(rate).all()
+            assert (rate >= 0).all()
+        assert (found.mixing > 0).all()
+
+
+# Speed. Every rate of the closure is a shear rate times lengths, and so are the rates of eqs. 1, 2 and 4 by time
+# not entering at all. The bed's motion is prescribed: its shear rate is omega times a function of place, and a
+# parcel stays at a place for a time proportional to 1 / omega. Probability = rate x time then holds no omega: with
+# A and B pure numbers there is no other time in the model (no gravity, no grain inertia, no viscosity) that could
+# make a dimensionless group with omega. So the product of a scene with exchange cannot depend on roll speed. A
+# closure that has speed in it needs another time scale, such as sqrt(s / g) of percolation under gravity.
+
+
+def test_probabilities_per_time_step_do_not_know_the_speed():
+    for factor in (2.0, 0.25, 1024.0):  # powers of two scale floats exactly
+        slow = mixed()
+        fast = slow.with_values({"rolls.speed": factor * slow.rolls.speed})
+        one, other = exchange.swap_rates(slow, *prepared(slow)), exchange.swap_rates(fast, *prepared(fast))
+        assert prepared(fast)[0].time_step == prepared(slow)[0].time_step / factor
+        for name in SwapRates._fields:
+            assert np.array_equal(getattr(one, name), getattr(other, name))
+    other = slow.with_values({"rolls.speed": 3.7 * slow.rolls.speed})
+    assert exchange.swap_rates(other, *prepared(other)).rise == pytest.approx(one.rise, rel=1e-12)
+
+
+@pytest.mark.parametrize("record", ["cells", "distributions"])
+def test_product_with_exchange_does_not_know_the_speed(record):
+    slow = mixed({"resolution.points": 16, "resolution.cells": 24, "resolution.record": record})
+    fast = slow.with_values({"rolls.speed": 2 * slow.rolls.speed})
+    one, other = simulate(slow, seed=1), simulate(fast, seed=1)
+    assert float(one["swaps_per_cell"]) > 0.5
+    product = "size" if record == "cells" else "mass_fraction"
+    for name in (product, "passing", "p50", "p80", "breaks_per_cell", "swaps_per_cell", "exchange_passes", "volume"):
+        assert np.array_equal(one[name], other[name]), name
+    assert float(other["throughput"]) == pytest.approx(2 * float(one["throughput"]))
+    assert float(other["elapsed_time"][0]) == pytest.approx(float(one["elapsed_time"][0]) / 2)
+
+
+# --- passes ------------------------------------------------------------------------------------------------
+
+
+def takes_part(number, passes, most):
+    """The condition of kernels.swap."""
+    return (number + 1) * passes // most != number * passes // most
+
+
+def random_rates(seed, points=12, edges=40, scale=1.0):
+    generator = np.random.default_rng(seed)
+    pairs = np.array([generator.choice(points, 2, replace=False) for _ in range(edges)])
+    rise, mixing = scale * generator.exponential(5, edges), scale * generator.exponential(0.1, edges)
+    return SwapRates(pairs, rise, mixing), generator.uniform(0.001, 0.06, points)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 0.3, 3.0, 100.0])
+def test_probabilities_of_a_cell_sum_to_at_most_half_in_every_pass(scale):
+    """The worst cells that could be there: every edge at its largest probability."""
+    busiest = 0.0
+    for seed in range(5):
+        rates, means = random_rates(seed, scale=scale)
+        largest = 0.06
+        passes = exchange.passes_needed(rates, rates.mixing, means, largest)
+        lower, upper = rates.pairs.T
+        worst = rates.mixing + rates.rise * (largest - means[lower] + means[upper])
+        most = passes.max()
+        times, spread = np.zeros(lower.size, int), np.zeros(lower.size)
+        for number in range(most):
+            part = takes_part(number, passes, most)
+            times += part
+            chance = np.where(part, worst / passes, 0)
+            spread += chance
+            sums = np.bincount(lower, chance, means.size) + np.bincount(upper, chance, means.size)
+            busiest = max(busiest, sums.max())
+            assert sums.max() <= 0.5 + 1e-12
+        assert np.array_equal(times, passes)  # every edge takes part as often as its probability was split
+        assert np.allclose(spread, worst, rtol=1e-12)  # and no probability is lost or clipped
+    if scale >= 3:
+        assert busiest > 0.4  # no more passes than needed
+    assert (scale > 1e-3) or most == 1
+
+
+def test_passes_by_hand():
+    """Three points in a row, sums 0.3, 1.2 and 0.9: 1, 3 and 2 passes, an edge as many as its needier point."""
+    rates = SwapRates(np.array([[0, 1], [1, 2]]), np.zeros(2), np.array([0.3, 0.9]))
+    assert exchange.passes_needed(rates, rates.mixing, np.full(3, 0.02), 0.06).tolist() == [3, 3]
+    rates = SwapRates(np.array([[0, 1], [2, 3]]), np.zeros(2), np.array([0.5, 0.51]))
+    assert exchange.passes_needed(rates, rates.mixing, np.full(4, 0.02), 0.06).tolist() == [1, 2]
+
+
+def test_segregation_counts_with_the_largest_grain_below_and_dust_above():
+    rates = SwapRates(np.array([[0, 1]]), np.array([10.0]), np.zeros(1))
+    means = np.array([0.01, 0.03])
+    assert exchange.passes_needed(rates, np.zeros(1), means, 0.06).tolist() == [2]  # 10 (0.05 + 0.03) = 0.8
+    assert exchange.passes_needed(rates, np.zeros(1), means, 0.02).tolist() == [1]  # 10 (0.01 + 0.03) = 0.4
+    assert exchange.passes_needed(rates, np.zeros(1), means, 0.001).tolist() == [1]  # none below the mean: 0.3
+
+
+@pytest.mark.parametrize("values", [{"exchange.mixing": 100}, {"exchange.segregation": 100}])
+def test_absurd_exchange_is_refused_with_its_cost(values):
+    scene = mixed({"resolution.streamlines": 40, "resolution.points": 200, "resolution.cells": 2} | values)
+    name = next(iter(values)).partition(".")[2]
+    with pytest.raises(ValueError, match=rf"exchange: .*{name} 100.* passes per time step") as refused:
+        simulate(scene)
+    for part in ("must be at most 1,000", "predicted cost above", " s; use fewer points"):
+        assert part in str(refused.value)
+
+
+def test_the_last_number_of_passes_that_is_not_refused():
+    rates = SwapRates(np.array([[0, 1]]), np.zeros(1), np.ones(1))
+    exchange.refuse_passes(mixed(), rates, exchange.MOST_PASSES)
+    with pytest.raises(ValueError, match=f"{exchange.MOST_PASSES + 1:,} passes"):
+        exchange.refuse_passes(mixed(), rates, exchange.MOST_PASSES + 1)
+
+
+# --- swaps: a column of parcels ----------------------------------------------------------------------------
+
+
+class Column:
+    """Parcels with edges between them, one pass after the other under held probabilities."""
+
+    def __init__(self, sizes, pairs=None, rise=0.0, mixing=0.0, means=None, seed=0):
+        self.sizes = np.array(sizes, np.float32)
+        points, cells = self.sizes.shape
+        blocks = -(-cells // kernels.BLOCK)
+        self.streams = np.arange(points * cells, dtype=np.uint64).reshape(points, cells)
+        self.reach, self.block_reach = (np.full((points, n), -1, np.float32) for n in (blocks * kernels.BLOCK, blocks))
+        self.stale, self.slots = np.ones(points, bool), np.arange(points)
+        if pairs is None:
+            pairs = np.column_stack([np.arange(points - 1), np.arange(1, points)])
+        self.pairs = np.array(pairs)
+        self.rise, self.mixing = (np.broadcast_to(rate, len(pairs)).astype(float) for rate in (rise, mixing))
+        self.means = self.sizes.mean(axis=1, dtype=float) if means is None else np.broadcast_to(means, points).copy()
+        self.keys = iter(streams(100_000 if COMPILED else 5000, seed))
+
+    def swap(self, times=1):
+        """Return the number of swaps of `times` passes."""
+        passes = np.ones(len(self.pairs), np.int64)
+        swaps = 0
+        for _ in range(times):
+            largest = self.sizes.max(axis=1)
+            swaps += kernels.swap(
+                self.sizes, self.streams, self.reach, self.block_reach, self.stale, largest, self.slots,
+                np.zeros(self.slots.size, bool), self.pairs, self.rise, self.mixing, passes, 1, self.means, 0,
+                next(self.keys), 1 / 0.06, 1e-6,
+            )  # fmt: skip
+            assert (largest >= self.sizes.max(axis=1)).all()
+        return swaps
+
+
+SPARSE, DENSEST = kernels.DENSE / 2, 0.3  # a probability on either branch of kernels.swap
+
+
+def halves(cells, **wishes):
+    """Two boxes, the upper all of size 2 and the lower all of size 1."""
+    return Column(np.repeat([[1.0], [2.0]], cells, axis=1), means=1.5, **wishes)
+
+
+@pytest.mark.parametrize("chance", [0.002, SPARSE, kernels.DENSE * 1.01, DENSEST, 0.5])
+def test_a8_two_boxes_mix_exponentially(chance):
+    """c - 1/2 = (1 - 2P)^t / 2: cells are independent, so the count is binomial at every t.
+
+    10 times, 5 sigma: by chance once in 170,000 tests. At P = 1/2 they are mixed at once.
+    """
+    cells = sized(40_000, 1_000)
+    column = halves(cells, mixing=chance, seed=1)
+    for t in range(1, 11):
+        column.swap()
+        expected = 0.5 + (1 - 2 * chance) ** t / 2
+        found = np.mean(column.sizes[1] == 2)
+        assert abs(found - expected) < SIGMAS * math.sqrt(expected * (1 - expected) / cells)
+    assert np.mean(column.sizes[0] == 1) == found
+
+
+@pytest.mark.parametrize("chance", [SPARSE, DENSEST])
+def test_a8_scatter_over_seeds_is_binomial(chance):
+    """Sum of squared z over seeds is chi-square; each tail 1e-6. Catches swaps that are drawn in common."""
+    cells, seeds = 400, sized(200, 40)
+    total = 0.0
+    for seed in range(seeds):
+        column = halves(cells, mixing=chance, seed=seed)
+        column.swap(3)
+        expected = 0.5 + (1 - 2 * chance) ** 3 / 2
+        total += (np.sum(column.sizes[1] == 2) - cells * expected) ** 2 / (cells * expected * (1 - expected))
+    assert stats.chi2.isf(1 - 1e-6, seeds) < total < stats.chi2.isf(1e-6, seeds)
+
+
+def agrees(counts, probabilities):
+    """Chi-square of counts at 1e-6, classes of less than 8 expected pooled."""
+    counts, expected = np.asarray(counts, float), np.sum(counts) * np.asarray(probabilities, float)
+    order = np.argsort(-expected)
+    counts, expected = counts[order], expected[order]
+    keep = max(1, int(np.sum(expected >= 8)))
+    counts = np.append(counts[:keep], counts[keep:].sum())
+    expected = np.append(expected[:keep], expected[keep:].sum())
+    used = expected > 1e-9
+    assert counts[~used].sum() == 0
+    return np.sum((counts - expected)[used] ** 2 / expected[used]) < stats.chi2.isf(1e-6, used.sum() - 1)
+
+
+@pytest.mark.parametrize("cells", [1, 7, 100])
+@pytest.mark.parametrize("chance", [0.001, SPARSE, kernels.DENSE, kernels.DENSE * 1.001, DENSEST])
+def test_number_of_swaps_of_an_edge_is_binomial(chance, cells):
+    """Geometric skipping is exact: in either branch the number of swaps follows Binomial(M, P). 1e-6 a test."""
+    trials = sized(4000, 400)
+    column = halves(cells, mixing=chance, seed=cells)
+    counts = np.bincount([column.swap() for _ in range(trials)], minlength=cells + 1)
+    assert agrees(counts, stats.binom(cells, chance).pmf(np.arange(cells + 1)))
+
+
+@pytest.mark.parametrize("chance", [SPARSE, DENSEST])
+def test_each_cell_swaps_as_often_as_any_other(chance):
+    """Counts of swaps per place are binomial over the passes: also the first and the last cell. 1e-6 a test."""
+    cells, passes = 20, sized(20_000, 1_000)
+    column = Column(np.arange(2.0 * cells).reshape(2, cells) + 1, mixing=chance, means=1.0, seed=3)
+    moved = np.zeros(cells)
+    for _ in range(passes):
+        before = column.sizes[0].copy()
+        column.swap()
+        moved += before != column.sizes[0]
+    statistic = np.sum((moved - passes * chance) ** 2 / (passes * chance * (1 - chance)))
+    assert statistic < stats.chi2.isf(1e-6, cells)
+    assert statistic > stats.chi2.isf(1 - 1e-6, cells)
+
+
+def test_swap_chance_of_every_pair_of_sizes():
+    """mixing + rise ((a - mean below)+ + (mean above - b)+), thinned or decided in turn. Binomial, 5 sigma, 32 tests."""
+    kinds, trials = np.array([0.01, 0.02, 0.03, 0.04]), sized(20_000, 800)
+    below, above = (grid.ravel() for grid in np.meshgrid(kinds, kinds + 0.001, indexing="ij"))
+    for scale in (0.1, 1.0):
+        rise, mixing, means = scale * 2.0, scale * 0.01, np.array([0.022, 0.031])
+        most = mixing + rise * (0.04 - 0.022 + 0.031)
+        assert (most > kernels.DENSE) == (scale == 1.0)
+        column = Column(
+            [np.repeat(below, trials), np.repeat(above, trials)], rise=rise, mixing=mixing, means=means, seed=4
+        )
+        first = column.sizes[0].copy()
+        column.swap()
+        swapped = (column.sizes[0] != first).reshape(16, trials).mean(axis=1)
+        chance = mixing + rise * (np.maximum(below - means[0], 0) + np.maximum(means[1] - above, 0))
+        assert np.all(abs(swapped - chance) < SIGMAS * np.sqrt(chance * (1 - chance) / trials))
+
+
+# --- A9: a chain of boxes ----------------------------------------------------------------------------------
+
+
+def mean_field(values, pairs, chances):
+    """One pass: E s <- prod_e (I - P L_e) E s, edges in order."""
+    values = np.array(values, float)
+    for (i, j), chance in zip(pairs, chances, strict=True):
+        flow = chance * (values[j] - values[i])
+        values[i] += flow
+        values[j] -= flow
+    return values
+
+
+RING = [(0, 1), (2, 1), (2, 3), (4, 3), (0, 4), (1, 3)]
+
+
+@pytest.mark.parametrize("scale", [0.03, 1.0])
+def test_a9_mean_sizes_follow_the_mean_field(scale):
+    """A network of five boxes, a probability for each edge. Counts of one size in a box are binomial.
+
+    5 boxes, 8 passes, 5 sigma: by chance once in 43,000 tests.
+    """
+    cells = sized(20_000, 800)
+    chances = scale * np.array([0.1, 0.25, 0.4, 0.05, 0.3, 0.15])
+    column = Column(
+        np.repeat([[2.0], [1.0], [1.0], [1.0], [1.0]], cells, axis=1), RING, mixing=chances, means=1.0, seed=5
+    )
+    share = np.array([1.0, 0, 0, 0, 0])
+    for _ in range(8):
+        column.swap()
+        share = mean_field(share, RING, chances)
+        found = np.mean(column.sizes == 2, axis=1)
+        assert np.all(abs(found - share) < SIGMAS * np.sqrt(share * (1 - share) / cells) + 1e-12)
+    assert share.sum() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("rise", [0.0, 3.0])
+@pytest.mark.parametrize("mixing", [0.0, SPARSE, DENSEST])
+def test_a9_cells_are_conserved_bit_for_bit_and_streams_travel_with_them(mixing, rise):
+    """Of every index: the multiset of (size, stream) pairs; so the mass of every size class, exactly."""
+    generator = np.random.default_rng(6)
+    sizes = generator.uniform(0.008, 0.06, (5, 100)).astype(np.float32)
+    column = Column(sizes, RING, rise=rise, mixing=mixing, seed=6)
+    owner = dict(zip(column.streams.ravel().tolist(), column.sizes.ravel().tolist(), strict=True))
+    swaps = column.swap(20)
+    assert (swaps > 50) == (rise > 0 or mixing > 0)
+    moved = np.mean(column.sizes != sizes)
+    assert (moved > 0.2) == (swaps > 0)
+    assert np.array_equal(np.sort(column.sizes, axis=0), np.sort(sizes, axis=0))
+    assert np.array_equal(np.sort(column.streams, axis=0), np.arange(500, dtype=np.uint64).reshape(5, 100))
+    assert all(
+        owner[stream] == size for stream, size in zip(column.streams.ravel(), column.sizes.ravel(), strict=True)
+    )
+    sieves = np.geomspace(0.008, 0.06, 9)
+    for before, after in ((sizes, column.sizes),):
+        assert np.array_equal(np.histogram(before, sieves)[0], np.histogram(after, sieves)[0])
+
+
+def test_slots_decide_which_parcels_swap():
+    """Parcels stay in their slots while points shift: edge and means are of points."""
+    straight = Column(np.arange(1.0, 301).reshape(3, 100), [(0, 1)], mixing=0.2, means=[1, 2, 3], seed=7)
+    turned = Column(np.roll(straight.sizes, 1, axis=0), [(0, 1)], mixing=0.2, means=[1, 2, 3], seed=7)
+    turned.slots = np.array([1, 2, 0])
+    straight.swap(3)
+    turned.swap(3)
+    assert np.array_equal(turned.sizes[turned.slots], straight.sizes)
+    assert np.array_equal(straight.sizes[2], np.arange(201.0, 301))
+
+
+def test_passes_share_the_edges_evenly():
+    """Edge e takes part in passes[e] of most_passes; with P = 1 each turn is seen as an exchange of two parcels."""
+    for most in (1, 3, 7):
+        for own in range(1, most + 1):
+            turns = []
+            for number in range(most):
+                column = halves(4, mixing=1.0)
+                swaps = kernels.swap(
+                    column.sizes, column.streams, column.reach, column.block_reach, column.stale,
+                    column.sizes.max(axis=1), column.slots, np.zeros(2, bool), column.pairs, column.rise,
+                    column.mixing, np.array([own]), most, column.means, number, np.uint64(1), 1 / 0.06, 1e-6,
+                )  # fmt: skip
+                turns.append(swaps == 4)
+            assert sum(turns) == own
+            assert turns == [takes_part(number, own, most) for number in range(most)]
+
+
+# --- the guard of 1/2 --------------------------------------------------------------------------------------
+
+
+def guarded(chance, cells, steps):
+    """Share of the upper box over time, each step split as the lattice splits it."""
+    column = halves(cells, mixing=0.0, seed=8)
+    rates = SwapRates(column.pairs, np.zeros(1), np.array([chance]))
+    passes = int(exchange.passes_needed(rates, rates.mixing, column.means, 2.0)[0])
+    column.mixing = rates.mixing / passes
+    shares = []
+    for _ in range(steps):
+        column.swap(passes)
+        shares.append(np.mean(column.sizes[1] == 2))
+    return np.array(shares)
+
+
+@pytest.mark.parametrize("chance", [0.6, 0.8, 0.95])
+def test_guard_keeps_swaps_from_overshooting(chance, monkeypatch):
+    """With the guard the upper box never holds less of its own than the other; without it, it oscillates about 1/2.
+
+    Binomial noise, 6 sigma: by chance once in 100 million tests.
+    """
+    cells = sized(20_000, 2_000)
+    noise = 6 * 0.5 / math.sqrt(cells)
+    assert guarded(chance, cells, 4).min() > 0.5 - noise
+    assert guarded(chance, cells, 1)[0] > 0.5 + noise / 2
+    monkeypatch.setattr(exchange, "LARGEST_SUM", INF)
+    free = guarded(chance, cells, 4)
+    assert free[0] < 0.5 - noise  # overshoots
+    assert np.allclose(free, 0.5 + (1 - 2 * chance) ** np.arange(1, 5) / 2, atol=noise)
+    if chance >= 0.8:
+        assert np.array_equal(np.sign(free[:3] - 0.5), [-1, 1, -1])
+
+
+def test_guard_counts_every_edge_of_a_cell():
+    """A cell with four edges of 0.3 would swap 1.2 times a step: three passes, though no edge is above 1/2."""
+    star = SwapRates(np.array([[0, k] for k in range(1, 5)]), np.zeros(4), np.full(4, 0.3))
+    assert exchange.passes_needed(star, star.mixing, np.full(5, 0.02), 0.06).tolist() == [3] * 4
+
+
+# --- diffusion against the error function ------------------------------------------------------------------
+
+
+def chain_rate(number, shear, time_step):
+    """Probability of a swap between boxes of a uniform column, from swap_rates itself, and box height d.
+
+    Squares: edges as long as the tube is wide, points as far apart as the tube feeds in a time step.
+    """
+    scene = paper({"exchange.segregation": 0, "exchange.mixing": 0.2, "resolution.streamlines": 2})
+    speed = scene.rolls.speed * scene.rolls.diameter / 2
+    width, height = scene.rolls.gap / 4, speed * time_step
+    flat = np.zeros((2, number))
+    motion = flow.Motion(flat, flat, np.zeros(number), flat, flat, flat + shear / math.sqrt(3), time_step)
+    state = prepared(paper())[1]._replace(solid_fraction=flat + 0.7)
+    pairs = np.column_stack([np.arange(number - 1), np.arange(1, number)])
+    edges = len(pairs)
+    cells = tessellation.Tessellation(
+        flat, pairs, np.full(edges, width), np.tile([0.0, 1.0], (edges, 1)), np.full(edges, height), None, None
+    )
+    return exchange.swap_rates(scene, motion, state, cells).mixing[0], height
+
+
+MEAN = 0.02
+DIFFUSIVITY = 0.2 * 30.0 * MEAN**2  # B gammadot sbar^2, m2/s
+
+
+def test_rate_of_a_uniform_column_is_diffusivity_times_dt_over_d2():
+    """l rho_b D / (d m) dt with m = rho_b l d is D dt / d2, D = B gammadot sbar^2."""
+    for time_step in (1e-3, 2e-3):
+        rate, height = chain_rate(5, 30.0, time_step)
+        assert rate * MEAN**2 == pytest.approx(DIFFUSIVITY * time_step / height**2, rel=1e-12)
+
+
+def step_profile(boxes, chance, passes):
+    share = np.repeat([1.0, 0.0], boxes // 2)
+    pairs = [(k, k + 1) for k in range(boxes - 1)]
+    for _ in range(passes):
+        share = mean_field(share, pairs, [chance] * (boxes - 1))
+    return share
+
+
+def error_function(boxes, spread):
+    """Exact share of a step that has diffused: averages over boxes of erfc(x / spread) / 2, spread = 2 sqrt(D t)."""
+    edges = (np.arange(boxes + 1) - boxes // 2) / spread
+    integral = edges * special.erfc(edges) - np.exp(-(edges**2)) / math.sqrt(math.pi)
+    return np.diff(integral) * spread / 2
+
+
+def test_variance_of_a_tracer_grows_by_exactly_2p_over_1_minus_p():
+    """Edges in order carry a cell up several boxes in one pass, and down one; on the average it stays.
+
+    Its mean displacement is -P + (1 - P)(P + P^2 + ...) = 0, its variance 2P / (1 - P): diffusion is that of
+    P / (1 - P), an error of first order in the time step which the passes keep below P = 1/2.
+    """
+    boxes, passes = 81, 10
+    for chance in (0.01, 0.1, 0.25):
+        share = np.zeros(boxes)
+        share[boxes // 2] = 1.0
+        pairs = [(k, k + 1) for k in range(boxes - 1)]
+        for _ in range(passes):
+            share = mean_field(share, pairs, [chance] * len(pairs))
+        place = np.arange(boxes) - boxes // 2
+        assert share @ place == pytest.approx(0, abs=1e-9)
+        assert share @ place**2 == pytest.approx(passes * 2 * chance / (1 - chance), rel=1e-6)
+
+
+def test_diffusion_converges_to_the_error_function_at_order_1_in_dt_and_2_in_d():
+    # time: the same D t = 8 boxes squared in more and more passes, against the boxes' exact solution
+    boxes, spread = 60, 2 * math.sqrt(8)
+    laplacian = np.diag(np.r_[1.0, np.full(boxes - 2, 2.0), 1.0]) - np.eye(boxes, k=1) - np.eye(boxes, k=-1)
+    start = np.repeat([1.0, 0.0], boxes // 2)
+    exact_boxes = linalg.expm(-8 * laplacian) @ start
+    errors = [np.abs(step_profile(boxes, 8 / n, n) - exact_boxes).max() for n in sized((40, 80, 160, 320), (40, 80))]
+    orders = np.diff(np.log(errors)) / -math.log(2)
+    assert np.all(abs(orders - 1) < 0.15), orders
+    # space: boxes' exact solution at D t = 2, 8, 32 boxes squared, that is d halved twice, against erfc
+    errors = []
+    for square in (2.0, 8.0, 32.0):
+        boxes = 20 * round(math.sqrt(square / 2))
+        laplacian = np.diag(np.r_[1.0, np.full(boxes - 2, 2.0), 1.0]) - np.eye(boxes, k=1) - np.eye(boxes, k=-1)
+        found = linalg.expm(-square * laplacian) @ np.repeat([1.0, 0.0], boxes // 2)
+        errors.append(np.abs(found - error_function(boxes, 2 * math.sqrt(square)))[boxes // 4 : -boxes // 4].max())
+    orders = np.diff(np.log(errors)) / -math.log(2)
+    assert np.all(abs(orders - 2) < 0.4), orders
+
+
+@pytest.mark.parametrize(("square", "passes"), [(4.0, 400), (4.0, 40)])
+def test_swaps_diffuse_a_tracer_as_the_error_function(square, passes):
+    """Every box within 5 sigma of the mean field and, with the mean field's own error added, of erfc.
+
+    P = 0.01 is drawn by skipping, P = 0.1 cell by cell. 40 boxes, 5 sigma: by chance once in 40,000 tests.
+    """
+    boxes, cells = 40, sized(4_000, 100)
+    passes = passes if COMPILED else passes // 2
+    chance = square / passes
+    rate, _ = chain_rate(boxes, 30.0, 1e-3)
+    mean = math.sqrt(chance / rate)  # the mean size at which the column of swap_rates has this probability
+    column = Column(
+        np.repeat(np.repeat([2.0, 1.0], boxes // 2)[:, None], cells, axis=1), mixing=rate * mean**2, means=1.5, seed=9
+    )
+    assert column.mixing[0] == pytest.approx(chance)
+    column.swap(passes)
+    found = np.mean(column.sizes == 2, axis=1)
+    expected = step_profile(boxes, chance, passes)
+    noise = SIGMAS * np.sqrt(expected * (1 - expected) / cells) + 1e-3
+    assert np.all(abs(found - expected) < noise)
+    exact = error_function(boxes, 2 * math.sqrt(square))
+    assert np.all(abs(found - exact) < noise + np.abs(expected - exact))
+    assert np.abs(expected - exact).max() < 0.3 * chance + 0.003
+
+
+# --- segregation against diffusion: the exact balance ------------------------------------------------------
+
+
+def weights_of(configurations, steps_up):
+    """Product over the large grains of the weight of their box."""
+    heights = np.concatenate([[1.0], np.cumprod(steps_up)])
+    return np.prod(np.where(configurations, heights, 1.0), axis=1)
+
+
+@pytest.mark.parametrize("speed", ["sparse", "dense"])
+@pytest.mark.parametrize("large", [1, 2])
+def test_segregation_and_diffusion_reach_their_exact_balance(large, speed):
+    """Two sizes S < L on a closed column, means held: each index is a chain of its own among configurations.
+
+    Across an edge, a large grain below a small one rises at mixing + rise (L - m_below + m_above - S), and one
+    above sinks at mixing, so every edge keeps the weights w_up / w_down = 1 + rise Delta / mixing, and so does
+    a pass over all edges. Counts of configurations against those weights, chi-square at 1e-6.
+    """
+    small, big, boxes = 0.01, 0.04, 4
+    means = np.array([0.02, 0.022, 0.025, 0.028])
+    delta = big - small + means[1:] - means[:-1]
+    mixing, rise = np.array([0.2, 0.1, 0.15]), np.array([4.0, 5.0, 1.0])
+    passes, cells = 60, sized(20_000, 600)
+    if speed == "sparse":  # the same balance at probabilities that are skipped through
+        mixing, rise, passes, cells = mixing / 40, rise / 40, sized(2400, 1600), sized(20_000, 150)
+        assert (mixing + rise * (big - means[:-1] + means[1:])).max() < kernels.DENSE
+    sizes = np.full((boxes, cells), small)
+    sizes[:large] = big  # all large grains start at the bottom
+    column = Column(sizes, rise=rise, mixing=mixing, means=means, seed=10 + large)
+    column.swap(passes)
+    at = column.sizes == np.float32(big)
+    assert (at.sum(axis=0) == large).all()
+    number = (at * 2 ** np.arange(boxes)[:, None]).sum(axis=0)
+    known = np.array([k for k in range(2**boxes) if k.bit_count() == large])
+    configurations = (known[:, None] >> np.arange(boxes)) & 1
+    weights = weights_of(configurations.astype(bool), 1 + rise * delta / mixing)
+    counts = np.array([np.sum(number == k) for k in known])
+    assert agrees(counts, weights / weights.sum())
+    assert not agrees(counts, np.full(known.size, 1 / known.size))  # and the test can tell
+
+
+def test_without_mixing_large_grains_end_on_top():
+    sizes = np.where(np.arange(3)[:, None] < 1, 0.04, 0.01) * np.ones((3, 200))
+    column = Column(sizes, rise=10.0, mixing=0.0, means=0.02, seed=11)
+    column.swap(200)
+    assert np.all(column.sizes[2] == np.float32(0.04))
+    assert column.swap(5) == 0
+
+
+def test_equal_sizes_do_not_segregate():
+    column = Column(np.full((2, 100), 0.02), rise=10.0, mixing=0.0, means=np.float64(np.float32(0.02)), seed=12)
+    assert column.swap(50) == 0
