@@ -18,7 +18,7 @@ _HOMES = {
     "Stress": "scene",
     "Exchange": "scene",
     "Resolution": "scene",
-    "simulate": "pipeline",
+    "simulate": "run",
     "passing": "metrics",
     "percentile_size": "metrics",
     "throughput": "metrics",

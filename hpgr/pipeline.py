@@ -1,62 +1,13 @@
-"""simulate(scene) -> Dataset: the one pipeline.
-
-Not simulate.py: importing a module of that name would replace the function `hpgr.simulate` by the module.
-"""
+"""Scene -> loaded bed -> crushed feed -> every variable of the Dataset, by name: the one pipeline."""
 
 from typing import Any, NamedTuple
 
 import numpy as np
-import xarray as xr
 
-from hpgr import __version__, budget, exchange, flow, geometry, metrics, schema, solve, stress, tessellation
-from hpgr.keys import refuse_key
-from hpgr.scene import LEVELS, Scene
+from hpgr import exchange, flow, geometry, metrics, schema, solve, stress, tessellation
+from hpgr.scene import Scene
 
 _NIPPING = 1.5  # top size over gap above which rolls nip single grains, which is not modelled
-
-
-def simulate(scene: Scene, seed: int = 0, replicate: int = 0) -> xr.Dataset:
-    """Simulate the steady machine of `scene`.
-
-    Parameters
-    ----------
-    scene : Scene
-        What is simulated; `scene.resolution.record` decides what is kept.
-    seed : int
-        Seed of all randomness, at least 0. The same scene and seed give the same bits.
-    replicate : int
-        Number of an independent repetition with the same seed, at least 0.
-
-    Returns
-    -------
-    xarray.Dataset
-        Dims time (photographs of the steady machine), streamline (mid-plane to roll), point (entry to
-        exit), cell and sieve; SI units. `attrs["scene"]` rebuilds the scene with
-        `Scene.model_validate_json`; `flags` and `attrs["notes"]` tell which limits were hit.
-
-    Raises
-    ------
-    ValueError
-        If the seed or replicate is not a whole number from 0 to 2**63 - 1, if material points coincide, or if
-        exchange would need absurdly many passes.
-    MemoryError
-        If the scene does not fit this machine's memory; the message has the predicted bytes.
-
-    Examples
-    --------
-    >>> import hpgr
-    >>> scene = hpgr.presets.paper().with_values({"resolution.cells": 200, "resolution.points": 50})
-    >>> dataset = hpgr.simulate(scene)
-    >>> dict(dataset["size"].sizes)
-    {'time': 1, 'streamline': 10, 'point': 50, 'cell': 200}
-    """
-    refuse_key("seed", seed)
-    refuse_key("replicate", replicate)
-    budget.refuse_too_large(scene)
-    prepared = prepare(scene)
-    values = crush(scene, prepared, seed, replicate)
-    notes = values.pop("notes")
-    return schema.to_dataset(values, _attributes(scene, seed, replicate, prepared) | {"notes": notes})
 
 
 class Prepared(NamedTuple):
@@ -239,20 +190,3 @@ def _notes(scene: Scene, bed: geometry.Geometry, state: stress.Load, crushed: so
     if scene.resolution.cells in (2, 3):
         notes["few_cells"] = "with 2 or 3 cells every cell neighbours every other; use more"
     return notes
-
-
-def _attributes(scene: Scene, seed: int, replicate: int, prepared: Prepared) -> dict[str, Any]:
-    level = scene.resolution.level
-    measured = {} if level == "custom" else {"level": f"{level}: {LEVELS[level].measured}"}
-    return measured | {
-        "Conventions": "CF-1.11",
-        "title": "Comminution in high pressure grinding rolls, heterarchical model",
-        "source": f"hpgr {__version__}",
-        "history": f"hpgr {__version__}: simulate(scene, seed={seed}, replicate={replicate})",
-        "scene": scene.model_dump_json(),
-        "seed": int(seed),
-        "replicate": int(replicate),
-        "solver": solve.choose(scene),
-        "time_step_s": prepared.motion.time_step,
-        "streamline_deviation_m": prepared.bed.deviation(),
-    }

@@ -63,8 +63,13 @@ VARIABLES = {
     "volume": Variable(_POINT, "m2", "area of the Voronoi cell of the material point, volume per roll width"),
     "swaps_per_cell": Variable((), "1", "mean number of swaps of a cell in one residence time"),
     "exchange_passes": Variable((), "1", "most passes a time step of exchange was split into", np.int32),
+    "p80_total_error": Variable((), "1", "estimated relative error of p80_total: bias + 2 standard errors"),
+    "fineness_error": Variable((), "1", "estimated relative error of the part below 1 mm: bias + 2 standard errors"),
+    "peak_pressure_error": Variable((), "1", "estimated relative error of peak_pressure: bias + 2 standard errors"),
     "flags": Variable((), "1", "limits that were hit", np.int32),
 }
+
+ERRORS = {"p80": "p80_total_error", "fineness": "fineness_error", "peak_pressure": "peak_pressure_error"}
 
 FLAGS = {
     "no_breakage": 1,

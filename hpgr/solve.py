@@ -1,6 +1,9 @@
 """Picks the cheapest solver the scene allows, runs it, and sums up the product (docs/model.md, Solvers)."""
 
 import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +16,7 @@ from hpgr.scene import Scene
 _NO_SIEVES = np.empty(0)
 _NO_SNAPSHOTS = np.empty((0, 0), np.float32)
 _NO_CLASSES = np.empty((0, 0), np.int64)
+_LARGE = 200_000  # cells of all parcels from which a case takes all cores; smaller ones fill them side by side
 
 
 class Exchanged(NamedTuple):
@@ -146,17 +150,25 @@ def _march(scene: Scene, log_stress: np.ndarray, seed: int, replicate: int) -> C
     size = np.empty((*shape, grid.cells), np.float32) if grid.record == "cells" else None
     sieves = _cell_sieves(scene) if grid.record == "distributions" else _NO_SIEVES
     classes = np.empty((*shape, sieves.size + 1), np.int64) if sieves.size else None
-    breaks = np.zeros(shape[1])
     reach_needed = parcels.reach_needed(scene, log_stress)
-    for photograph in range(shape[0]):
-        for line in range(shape[1]):
-            product[photograph, line], streams = parcels.first_cells(scene, seed, (replicate, line, photograph))
-            breaks[line] += kernels.march(
-                product[photograph, line], streams, log_stress[line], reach_needed[line], sieves,
-                _NO_SNAPSHOTS if size is None else size[photograph, line],
-                _NO_CLASSES if classes is None else classes[photograph, line],
-                *parcels.constants(scene),
-            )  # fmt: skip
+    constants = parcels.constants(scene)
+
+    def march(photograph: int, line: int) -> int:
+        product[photograph, line], streams = parcels.first_cells(scene, seed, (replicate, line, photograph))
+        return kernels.march(
+            product[photograph, line], streams, log_stress[line], reach_needed[line], sieves,
+            _NO_SNAPSHOTS if size is None else size[photograph, line],
+            _NO_CLASSES if classes is None else classes[photograph, line],
+            *constants,
+        )  # fmt: skip
+
+    breaks = np.zeros(shape[1])
+    columns = list(np.ndindex(*shape[:2]))
+    threads = os.cpu_count() if product.size >= _LARGE else 1
+    with ThreadPoolExecutor(threads) if threads > 1 else nullcontext() as pool:
+        found = (pool.map if pool else map)(lambda column: march(*column), columns)
+        for (_, line), count in zip(columns, found, strict=True):
+            breaks[line] += count
     return _summarised(scene, product, breaks, size, classes)
 
 

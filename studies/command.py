@@ -58,6 +58,8 @@ class Options:
     """Material points per streamline (default: the scene's)."""
     streamlines: Annotated[int | None, shown_as("N")] = None
     """Streamlines from the mid-plane to the roll (default: the scene's)."""
+    tolerance: Annotated[float | None, shown_as("X")] = None
+    """Relative error wanted, such as 0.01: every operating point is refined until its estimate is below it."""
     sieve: Annotated[str, shown_as("LENGTH")] = "1 mm"
     """Sieve whose percent passing is shown."""
     workers: Annotated[int, shown_as("N")] = 2
@@ -179,7 +181,9 @@ def _sieve(options: Options, scene: Scene) -> float:
 def _sweep(scene: Scene, axes: dict[str, list], options: Options) -> "xr.Dataset":
     from studies.sweep import sweep
 
-    common = {"replicates": options.replicates, "seed": options.seed, "progress": True}
+    if options.tolerance is not None and not 1e-4 <= options.tolerance <= 0.5:
+        raise ValueError(f"--tolerance: got {options.tolerance:g}; must be within 0.0001 to 0.5; such as 0.01")
+    common = {"tolerance": options.tolerance, "replicates": options.replicates, "seed": options.seed, "progress": True}
     if options.scheduler is None:
         return sweep(scene, axes, threads=options.workers, **common)
     from distributed import Client

@@ -5,7 +5,7 @@ import xarray as xr
 
 from hpgr import units
 from hpgr.scene import Scene
-from hpgr.schema import FLAGS
+from hpgr.schema import ERRORS, FLAGS
 from studies.sweep import STATUS
 
 
@@ -80,6 +80,10 @@ def notes(result: xr.Dataset) -> list[str]:
     """Return a line for the scene's own note, and for each limit that operating points have hit."""
     own = Scene.model_validate_json(result.attrs["scene"]).note
     lines = [f"note: {own}"] if own else []
+    if "p80_total_error" in result:
+        worst = {name: 100 * float(result[error].max()) for name, error in ERRORS.items() if error in result}
+        told = ", ".join(f"{name.replace('_', ' ')} {error:.2g} %" for name, error in worst.items())
+        lines.append(f"estimated errors of a run (bias + 2 standard errors), at most: {told}")
     if "flags" not in result:
         return lines
     points = operating_points(result)

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 import hpgr
 from hpgr import budget, pipeline, schema
+from hpgr import tolerance as tolerances
 from hpgr.keys import refuse_key
 from hpgr.scene import Scene, faults_of, field_info, field_value
 
@@ -54,6 +55,7 @@ def sweep(
     client: Any = None,
     threads: int = 2,
     progress: bool = False,
+    tolerance: float | None = None,
 ) -> "xr.Dataset":
     """Run `scene` at every combination of `axes`, and return the summaries as one Dataset.
 
@@ -74,6 +76,9 @@ def sweep(
         Threads if no client is given.
     progress : bool
         Whether to show progress on standard error.
+    tolerance : float, optional
+        Wanted relative error, as in `hpgr.simulate`: every operating point gets a resolution of its own, and
+        its estimated errors. Where streamlines differ, variables along them are left out.
 
     Returns
     -------
@@ -102,8 +107,9 @@ def sweep(
         raise ValueError(f"replicates: got {replicates}; must be at least 1; such as replicates=3")
     base = scene.with_values({"resolution.record": "product"})
     cases = list(enumerate_cases(grid, replicates))
-    outcomes = _outcomes(base, cases, seed, client, threads, progress)
-    return _assemble(base, grid, replicates, seed, outcomes)
+    outcomes = _outcomes((base, seed, tolerance), cases, client, threads, progress)
+    result = _assemble(base, grid, replicates, seed, outcomes)
+    return result if tolerance is None else result.assign_attrs(tolerance=tolerance)
 
 
 def axis_values(axes: Mapping[str, Iterable]) -> dict[str, list]:
@@ -154,20 +160,26 @@ def dim_of(name: str) -> str:
 class Bench:
     """Runs the cases of a batch one after the other, and keeps what the next may share: scene and loaded bed."""
 
-    def __init__(self, base: Scene, seed: int):
-        self._base, self._seed = base, seed
+    def __init__(self, base: Scene, seed: int, tolerance: float | None = None):
+        self._base, self._seed, self._tolerance = base, seed, tolerance
         self._values: dict[str, Any] | None = None
         self._scene, self._key, self._prepared = base, None, None
+        self._errors: dict[str, float] = {}
 
     def simulate(self, case: Case) -> dict[str, Any]:
         """Return the variables of a case by name, as `hpgr.simulate` would."""
         if case.values != self._values:
-            self._scene, self._values = self._base.with_values(case.values), case.values
+            self._scene, self._values = self._base.with_values(case.values), None
+            if self._tolerance is not None:
+                estimate = tolerances.refine(self._scene, self._tolerance, seed=self._seed)
+                self._scene = estimate.scene
+                self._errors = {schema.ERRORS[name]: error for name, error in estimate.errors().items()}
             budget.refuse_too_large(self._scene)
+            self._values = case.values  # now only: a refused scene must not be taken for the next replicate's
         key = pipeline.bed_key(self._scene)
         if key != self._key:
             self._prepared, self._key = pipeline.prepare(self._scene), key
-        return pipeline.crush(self._scene, self._prepared, self._seed, case.replicate)
+        return pipeline.crush(self._scene, self._prepared, self._seed, case.replicate) | self._errors
 
 
 def run_case(bench: Bench, case: Case) -> Outcome:
@@ -195,12 +207,12 @@ def summarise(values: Mapping[str, Any]) -> dict[str, tuple[tuple[str, ...], np.
     }
 
 
-def _run_batch(base: Scene, cases: list[Case], seed: int) -> list[Outcome]:
-    bench = Bench(base, seed)
+def _run_batch(bench_of: tuple, cases: list[Case]) -> list[Outcome]:
+    bench = Bench(*bench_of)
     return [run_case(bench, case) for case in cases]
 
 
-def _outcomes(base, cases, seed, client, threads, progress) -> Iterator[Outcome]:
+def _outcomes(bench_of, cases, client, threads, progress) -> Iterator[Outcome]:
     """Yield the outcome of every case as it comes in, in no particular order."""
     from distributed import Client, LocalCluster, as_completed  # late: importing costs 0.5 s
 
@@ -217,12 +229,12 @@ def _outcomes(base, cases, seed, client, threads, progress) -> Iterator[Outcome]
             ) as cluster,
             Client(cluster) as own,
         ):
-            yield from _outcomes(base, cases, seed, own, threads, progress)
+            yield from _outcomes(bench_of, cases, own, threads, progress)
         return
     workers = max(1, sum(client.nthreads().values()))
     size = min(_BATCH, max(1, len(cases) // (4 * workers)))
     batches = [cases[start : start + size] for start in range(0, len(cases), size)]
-    futures = client.map(_run_batch, [base] * len(batches), batches, [seed] * len(batches), pure=False)
+    futures = client.map(_run_batch, [bench_of] * len(batches), batches, pure=False)
     sent = dict(zip(futures, batches, strict=True))
     with _bar(len(cases), progress) as bar:
         for future in as_completed(futures, raise_errors=False):

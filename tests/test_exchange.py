@@ -173,14 +173,23 @@ def test_segregation_counts_with_the_largest_grain_below_and_dust_above():
     assert exchange.passes_needed(rates, np.zeros(1), means, 0.001).tolist() == [1]  # none below the mean: 0.3
 
 
-@pytest.mark.parametrize("values", [{"exchange.mixing": 100}, {"exchange.segregation": 100}])
-def test_absurd_exchange_is_refused_with_its_cost(values):
-    scene = mixed({"resolution.streamlines": 40, "resolution.points": 200, "resolution.cells": 2} | values)
-    name = next(iter(values)).partition(".")[2]
-    with pytest.raises(ValueError, match=rf"exchange: .*{name} 100.* passes per time step") as refused:
-        simulate(scene)
+def test_absurd_exchange_is_refused_with_its_cost():
+    scene = mixed({"resolution.streamlines": 40, "resolution.points": 200, "resolution.cells": 2})
+    with pytest.raises(ValueError, match=r"exchange: .*mixing 100 need .* passes per time step") as refused:
+        simulate(scene.with_values({"exchange.mixing": 100}))
     for part in ("must be at most 1,000", "predicted cost above", " s; use fewer points"):
         assert part in str(refused.value)
+
+
+def test_absurd_segregation_is_refused_too(monkeypatch):
+    scene = mixed(
+        {"resolution.points": sized(16, 6), "resolution.cells": 2, "exchange.segregation": 100, "exchange.mixing": 0}
+    )
+    needed = int(simulate(scene)["exchange_passes"])
+    assert needed > 20
+    monkeypatch.setattr(exchange, "MOST_PASSES", needed // 2)
+    with pytest.raises(ValueError, match=rf"exchange: segregation 100 .* passes .* at most {needed // 2:,}; predicted"):
+        simulate(scene)
 
 
 def test_the_last_number_of_passes_that_is_not_refused():
@@ -285,6 +294,24 @@ def test_number_of_swaps_of_an_edge_is_binomial(chance, cells):
     assert agrees(counts, stats.binom(cells, chance).pmf(np.arange(cells + 1)))
 
 
+@pytest.mark.parametrize("chance", [kernels.DENSE, DENSEST])
+def test_neighbouring_cells_swap_independently(chance):
+    """Both of two neighbours with P^2: skipping leaves none out. 6 sigma: by chance once in 10^8."""
+    cells, trials = 100, sized(4000, 300)
+    pairs = 0
+    for seed in range(trials // 100):
+        column = Column(np.arange(2.0 * cells).reshape(2, cells) + 1, mixing=chance, means=1.0, seed=seed)
+        for _ in range(100):
+            before = column.sizes[0].copy()
+            column.swap()
+            moved = before != column.sizes[0]
+            pairs += np.sum(moved[1:] & moved[:-1])
+    expected = trials * (cells - 1) * chance**2
+    # neighbouring pairs share a cell: variance n P^2 (1 - P^2) + 2 n (P^3 - P^4)
+    noise = math.sqrt(expected * (1 - chance**2 + 2 * chance * (1 - chance)))
+    assert abs(pairs - expected) < 6 * noise
+
+
 @pytest.mark.parametrize("chance", [SPARSE, DENSEST])
 def test_each_cell_swaps_as_often_as_any_other(chance):
     """Counts of swaps per place are binomial over the passes: also the first and the last cell. 1e-6 a test."""
@@ -301,7 +328,10 @@ def test_each_cell_swaps_as_often_as_any_other(chance):
 
 
 def test_swap_chance_of_every_pair_of_sizes():
-    """mixing + rise ((a - mean below)+ + (mean above - b)+), thinned or decided in turn. Binomial, 5 sigma, 32 tests."""
+    """mixing + rise ((a - mean below)+ + (mean above - b)+), thinned or decided in turn.
+
+    Binomial, 5 sigma, 32 comparisons: by chance once in 54,000 tests.
+    """
     kinds, trials = np.array([0.01, 0.02, 0.03, 0.04]), sized(20_000, 800)
     below, above = (grid.ravel() for grid in np.meshgrid(kinds, kinds + 0.001, indexing="ij"))
     for scale in (0.1, 1.0):
@@ -368,12 +398,7 @@ def test_a9_cells_are_conserved_bit_for_bit_and_streams_travel_with_them(mixing,
     assert (moved > 0.2) == (swaps > 0)
     assert np.array_equal(np.sort(column.sizes, axis=0), np.sort(sizes, axis=0))
     assert np.array_equal(np.sort(column.streams, axis=0), np.arange(500, dtype=np.uint64).reshape(5, 100))
-    assert all(
-        owner[stream] == size for stream, size in zip(column.streams.ravel(), column.sizes.ravel(), strict=True)
-    )
-    sieves = np.geomspace(0.008, 0.06, 9)
-    for before, after in ((sizes, column.sizes),):
-        assert np.array_equal(np.histogram(before, sieves)[0], np.histogram(after, sieves)[0])
+    assert all(owner[stream] == size for stream, size in zip(column.streams.ravel(), column.sizes.ravel(), strict=True))
 
 
 def test_slots_decide_which_parcels_swap():
@@ -429,7 +454,6 @@ def test_guard_keeps_swaps_from_overshooting(chance, monkeypatch):
     cells = sized(20_000, 2_000)
     noise = 6 * 0.5 / math.sqrt(cells)
     assert guarded(chance, cells, 4).min() > 0.5 - noise
-    assert guarded(chance, cells, 1)[0] > 0.5 + noise / 2
     monkeypatch.setattr(exchange, "LARGEST_SUM", INF)
     free = guarded(chance, cells, 4)
     assert free[0] < 0.5 - noise  # overshoots
@@ -512,7 +536,7 @@ def test_variance_of_a_tracer_grows_by_exactly_2p_over_1_minus_p():
 
 def test_diffusion_converges_to_the_error_function_at_order_1_in_dt_and_2_in_d():
     # time: the same D t = 8 boxes squared in more and more passes, against the boxes' exact solution
-    boxes, spread = 60, 2 * math.sqrt(8)
+    boxes = 60
     laplacian = np.diag(np.r_[1.0, np.full(boxes - 2, 2.0), 1.0]) - np.eye(boxes, k=1) - np.eye(boxes, k=-1)
     start = np.repeat([1.0, 0.0], boxes // 2)
     exact_boxes = linalg.expm(-8 * laplacian) @ start
@@ -599,9 +623,10 @@ def test_segregation_and_diffusion_reach_their_exact_balance(large, speed):
 def test_without_mixing_large_grains_end_on_top():
     sizes = np.where(np.arange(3)[:, None] < 1, 0.04, 0.01) * np.ones((3, 200))
     column = Column(sizes, rise=10.0, mixing=0.0, means=0.02, seed=11)
-    column.swap(200)
-    assert np.all(column.sizes[2] == np.float32(0.04))
-    assert column.swap(5) == 0
+    for _ in range(2):  # and stay there; equal grains go on changing places, which nothing sees
+        column.swap(200)
+        assert np.all(column.sizes[2] == np.float32(0.04))
+        assert np.all(column.sizes[:2] == np.float32(0.01))
 
 
 def test_equal_sizes_do_not_segregate():

@@ -11,7 +11,7 @@ import xarray as xr
 from support import paper
 
 import hpgr
-from hpgr import schema
+from hpgr import pipeline, schema
 from studies import sweep as module
 from studies.gap_sweep import main
 from studies.sweep import STATUS, sweep
@@ -271,30 +271,30 @@ def test_refused_case_loses_itself_only(base, client):
     ],
 )
 def test_raising_case_loses_itself_only(base, client, good, monkeypatch, raised, status, words):
-    real = hpgr.simulate
+    real = pipeline.crush
 
-    def simulate(scene, seed, replicate):
+    def crush(scene, prepared, seed, replicate):
         if scene.rolls.gap == 0.05 and replicate == 2:
             raise raised
-        return real(scene, seed, replicate)
+        return real(scene, prepared, seed, replicate)
 
-    monkeypatch.setattr(hpgr, "simulate", simulate)
+    monkeypatch.setattr(pipeline, "crush", crush)
     # 12 cases on one thread: batches of 3, so the others share a batch with the one that raises
     result = sweep(base, {"rolls.gap": GAPS}, replicates=4, client=client)
     lost_only(result, good, (1, 2), status, *words)
 
 
 def test_case_that_is_not_finite_loses_itself_only(base, client, good, monkeypatch):
-    real = hpgr.simulate
+    real = pipeline.crush
 
-    def simulate(scene, seed, replicate):
-        found = real(scene, seed, replicate)
+    def crush(scene, prepared, seed, replicate):
+        found = real(scene, prepared, seed, replicate)
         if scene.rolls.gap == 0.06 and replicate == 0:
             found["p80"][1] = np.nan
             found["throughput"] = found["throughput"] * np.inf
         return found
 
-    monkeypatch.setattr(hpgr, "simulate", simulate)
+    monkeypatch.setattr(pipeline, "crush", crush)
     result = sweep(base, {"rolls.gap": GAPS}, replicates=4, client=client)
     lost_only(result, good, (2, 0), "failed", "not finite", "p80", "throughput")
     assert "p50" not in result["message"].values[2, 0]
@@ -304,10 +304,10 @@ def test_lost_task_loses_its_batch_only(base, client, monkeypatch):
     good = sweep(base, {"rolls.gap": GAPS}, client=client)
     real = module.run_case
 
-    def run_case(scene, case, seed):
+    def run_case(bench, case):
         if case.index == (1, 0):
             raise SystemError("worker lost")
-        return real(scene, case, seed)
+        return real(bench, case)
 
     monkeypatch.setattr(module, "run_case", run_case)
     result = sweep(base, {"rolls.gap": GAPS}, client=client)

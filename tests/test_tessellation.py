@@ -124,7 +124,7 @@ def test_edges_lie_halfway_between_their_points_and_close_each_inner_cell(gap):
     """Of a cell inside the bed: sum of length x outward normal = 0, and area = sum of length x distance / 4."""
     places, found = tiled(scene_of(gap, 6, 40))
     inner = shapely.distance(found.cells, found.domain.exterior) > 1e-12
-    assert inner.sum() > 100
+    assert inner.sum() > 50
     lower, upper = found.pairs.T
     flux, area, around = np.zeros_like(places), np.zeros(len(places)), np.zeros(len(places))
     for side, sign in ((lower, 1), (upper, -1)):
@@ -166,9 +166,7 @@ def test_squares_by_hand(monkeypatch):
     for pair, length in sides.items():
         k = by_pair[pair if pair in by_pair else pair[::-1]]
         assert found.length[k] == pytest.approx(length, rel=1e-12)
-        assert found.normal[k] == pytest.approx([math.copysign(1, pair[0] - pair[1]) * 1, 0], abs=1e-12) or (
-            found.normal[k] == pytest.approx([1, 0], abs=1e-12)
-        )
+        assert abs(found.normal[k]) == pytest.approx([1, 0], abs=1e-12)
     for pair, length in heights.items():  # the lower point first
         k = by_pair[pair]
         assert found.length[k] == pytest.approx(length, rel=1e-12)
@@ -215,7 +213,7 @@ def test_points_that_coincide_are_refused():
     bed, motion = laid(scene)
     x, y = motion.x.copy(), motion.y.copy()
     x[1, 7], y[1, 7] = x[0, 7], y[0, 7]
-    with pytest.raises(ValueError, match="tessellation: .* lie too close together .* use fewer streamlines"):
+    with pytest.raises(ValueError, match=r"tessellation: .* lie too close together .* use fewer streamlines"):
         tessellation.tessellate(scene, bed, motion._replace(x=x, y=y))
 
 
@@ -233,7 +231,7 @@ def test_lost_points_are_refused(monkeypatch):
     whole = shapely.voronoi_polygons
     lossy = lambda points, **wishes: whole(shapely.multipoints(shapely.get_parts(points)[:-2]), **wishes)  # noqa: E731
     monkeypatch.setattr(tessellation.shapely, "voronoi_polygons", lossy)
-    with pytest.raises(ValueError, match="tessellation: 2 of 63 points have no cell; .* use fewer streamlines"):
+    with pytest.raises(ValueError, match=r"tessellation: 2 of 63 points have no cell; .* use fewer streamlines"):
         tiled(scene_of())
 
 
@@ -247,13 +245,12 @@ def test_a_gap_below_double_precision_is_refused_or_tiled():
         try:
             _, found = tiled(scene_of(float(gap), 50, 5))
         except ValueError as error:
-            assert "points lie too close together" in str(error)
-            outcomes.add("refused")
+            outcomes.add(str(error).partition("; ")[2].partition("; ")[0])
         else:
             assert abs(found.volume.sum() / found.domain.area - 1) < 1e-9
             assert (found.volume > 0).all()
             outcomes.add("tiled")
-    assert "refused" in outcomes
+    assert outcomes - {"tiled"} == {"the material points lie too close together for double precision"}
 
 
 # --- only what the scene requires --------------------------------------------------------------------------

@@ -1,0 +1,93 @@
+"""Cost of cases: one warm run, a thousand in a sweep, the lattice, a large case. Run: python -m benchmarks.cases
+
+Every figure is the median of repeats in this one process; ratios are of figures measured side by side. Run it on a
+quiet machine, from a clone.
+"""
+
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import time
+
+import numpy as np
+
+import hpgr
+from hpgr import kernels, parcels, pipeline, solve
+from studies.sweep import sweep
+
+
+def median_ms(function, repeats=30):
+    """Return the median time of a call in ms, after one that warms up."""
+    function()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - start)
+    return 1e3 * statistics.median(times)
+
+
+def kernel_ms(scene, prepared):
+    """Return the median time in the crushing kernel of one run, with fresh cells each time."""
+    with np.errstate(divide="ignore"):
+        log_stress = np.log(prepared.crushing / scene.material.strength)
+    needed = parcels.reach_needed(scene, log_stress)
+    none = (np.empty(0), np.empty((0, 0), np.float32), np.empty((0, 0), np.int64))
+    times = []
+    for replicate in range(31):
+        cells = [parcels.first_cells(scene, 0, (replicate, line, 0)) for line in range(len(log_stress))]
+        start = time.perf_counter()
+        for line, (sizes, streams) in enumerate(cells):
+            kernels.march(sizes, streams, log_stress[line], needed[line], *none, *parcels.constants(scene))
+        times.append(time.perf_counter() - start)
+    return 1e3 * statistics.median(times[1:])
+
+
+def main():
+    """Print every figure."""
+    print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}")
+    scene = hpgr.presets.paper().with_values({"resolution.record": "product"})
+    prepared = pipeline.prepare(scene)
+    print(f"simulate, 10 x 200 x 1,000, product: {median_ms(lambda: hpgr.simulate(scene)):.2f} ms")
+    print(f"  of which the kernel:               {kernel_ms(scene, prepared):.2f} ms")
+    print(f"  of which bed and stress:           {median_ms(lambda: pipeline.prepare(scene)):.2f} ms")
+    print(f"a case that shares its bed:          {median_ms(lambda: pipeline.crush(scene, prepared, 0, 0)):.2f} ms")
+
+    axes = {"rolls.gap": np.linspace(0.03, 0.1, 50), "feed.top_size": np.linspace(0.03, 0.06, 20)}
+    timed = {}
+    for threads in (1, 2, 1, 2, 1, 2):
+        start = time.perf_counter()
+        sweep(scene, axes, threads=threads)
+        timed.setdefault(threads, []).append(time.perf_counter() - start)
+    one, two = (statistics.median(timed[threads]) for threads in (1, 2))
+    print(f"sweep of 1,000 cases: {one:.2f} s on 1 thread, {two:.2f} s on 2 (ratio {one / two:.2f})")
+
+    mixed = scene.with_values({"exchange": {}})
+    seconds = median_ms(lambda: hpgr.simulate(mixed), 3) / 1e3
+    swaps = float(hpgr.simulate(mixed)["swaps_per_cell"]) * 10 * 200 * 1000 / 2
+    print(f"lattice, one residence time: {seconds:.2f} s, {1e9 * seconds / swaps:.1f} ns per swap, all else included")
+    twice = mixed.with_values({"exchange.interval": 199, "resolution.photographs": 2})
+    print(f"lattice, two residence times: {median_ms(lambda: hpgr.simulate(twice), 1) / 1e3:.2f} s")
+    still = scene.with_values({"exchange.mixing": 0, "exchange.segregation": 0})
+    print(f"lattice without swaps, one residence time: {median_ms(lambda: hpgr.simulate(still), 3) / 1e3:.2f} s")
+
+    large = scene.with_values({"resolution.cells": 1_000_000})
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    many = median_ms(lambda: hpgr.simulate(large), 1) / 1e3
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    solve._LARGE, kept = float("inf"), solve._LARGE
+    alone = median_ms(lambda: hpgr.simulate(large), 1) / 1e3
+    solve._LARGE = kept
+    print(f"10 x 200 x 1,000,000: {alone:.2f} s on one core, {many:.2f} s on all; {grown:.0f} MiB above before")
+
+    for arguments in (["--help"], ["--no-plot", "--out", "outputs/benchmark.nc"], ["--out", "outputs/benchmark.nc"]):
+        start = time.perf_counter()
+        subprocess.run([sys.executable, "-m", "studies.gap_sweep", *arguments], check=True, capture_output=True)
+        print(f"python -m studies.gap_sweep {' '.join(arguments)}: {time.perf_counter() - start:.2f} s")
+
+
+if __name__ == "__main__":
+    main()

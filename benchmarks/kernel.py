@@ -1,0 +1,200 @@
+"""Cost of the crushing kernel on the paper's scene, against plain versions of its rule and the machine's limits.
+
+Run by hand, from the root of the repository: `python -m benchmarks.kernel`. About a minute; one core.
+Every repeat marches fresh copies of the same cells along the central streamline, all in one process.
+"""
+
+import functools
+import math
+import os
+import platform
+import statistics
+import time
+from pathlib import Path
+
+import numba
+import numpy as np
+from numba import njit
+
+from hpgr import feed, flow, geometry, kernels, presets, stress
+
+POINTS = (100, 200, 400, 800, 1600, 3200)
+EXPONENTS = (0.5, 1.0, math.inf)
+CELLS = (1_000, 100_000)
+PLAIN_POINTS = 100  # the plain versions cost the same at every point
+CELLS_PER_TIMING = 100_000  # short lines are marched several times per timing
+REPEATS, PLAIN_REPEATS = 15, 3
+GAMMA = 1.0
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+
+
+def case(points, cells):
+    """Return a line of cells with its streams, and log(sigma_a / sigma_m) along the streamline."""
+    scene = presets.paper()
+    motion = flow.move(scene, geometry.bed(scene.rolls, 10), points)
+    crushing = stress.crushing_stress(scene, motion, stress.load(scene, motion))
+    with np.errstate(divide="ignore"):
+        log_stress = np.log(crushing[0] / scene.material.strength)
+    seeds = np.random.SeedSequence(0, spawn_key=(0, 0, 0))
+    streams = np.empty(cells, np.uint64)
+    kernels.start_streams(seeds.generate_state(1, np.uint64)[0], streams)
+    return feed.draw(scene.feed, cells, seeds), streams, log_stress
+
+
+def material(n):
+    """Return slope, cushion, strength size and size floor of the scene's material with exponent n."""
+    scene = presets.paper()
+    return 3 / scene.material.weibull_modulus, 0.5 / n**2, scene.material.strength_size, 1e-6
+
+
+def bounded(sizes, streams, log_stress, n):
+    slope, cushion, strength_size, floor = material(n)
+    nothing = np.empty(0), np.empty((0, 0), np.float32), np.empty((0, 0), np.int64)
+    needed = np.exp(-log_stress / slope)
+    kernels.march(sizes, streams, log_stress, needed, *nothing, slope, cushion, 1 / GAMMA, strength_size, floor)
+
+
+@njit
+def _compiled(sizes, streams, log_stress, slope, cushion, strength_size, floor):
+    cells, breaking = sizes.size, np.empty(sizes.size, np.bool_)
+    for level in log_stress:
+        for p in range(cells):
+            size = np.float64(sizes[p])
+            left, right = sizes[p - 1 if p > 0 else cells - 1], sizes[p + 1 if p + 1 < cells else 0]
+            mean = ((np.float64(left) + np.float64(right)) + size) / 3.0
+            unlike = math.log(size / mean)
+            strength = cushion * unlike * unlike - slope * math.log(size / strength_size)
+            breaking[p] = (level >= strength) & (size >= floor)
+        for p in range(cells):
+            if breaking[p]:
+                streams[p] += GOLDEN
+                size = sizes[p] * kernels.fragment_ratio(streams[p], 1 / GAMMA)
+                sizes[p] = np.float32(max(size, kernels.SMALLEST))
+
+
+def compiled(sizes, streams, log_stress, n):
+    _compiled(sizes, streams, log_stress, *material(n))
+
+
+def vectorised(sizes, streams, log_stress, n):
+    slope, cushion, strength_size, floor = material(n)
+    for level in log_stress:
+        size = sizes.astype(float)
+        mean = (np.roll(size, 1) + np.roll(size, -1) + size) / 3
+        strength = cushion * np.log(size / mean) ** 2 - slope * np.log(size / strength_size)
+        broken = np.flatnonzero((level >= strength) & (size >= floor))
+        streams[broken] += GOLDEN
+        uniform = ((mixed(streams[broken]) >> np.uint64(12)) + 0.5) * 2.0**-52
+        sizes[broken] = np.maximum(size[broken] * uniform, kernels.SMALLEST)
+
+
+def mixed(state):
+    z = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+@njit
+def _read(bits, times):
+    total = 0
+    for k in range(times):
+        part = np.int32(k)
+        for p in range(bits.size):
+            part ^= bits[p]
+        total += part
+    return total
+
+
+@njit
+def _compare(values, needed, times):
+    total = 0
+    for k in range(times):
+        level = np.float32(needed + k)
+        hits = np.int32(0)
+        for p in range(values.size):
+            hits += np.int32(values[p] >= level)
+        total += hits
+    return total
+
+
+def timed(march, line, cells, n, repeats):
+    """Return the nanoseconds per cell of each of `repeats` marches over fresh data; the first is left out."""
+    sizes, streams, log_stress = line
+    lines = max(1, CELLS_PER_TIMING // cells)
+    found = []
+    for _ in range(repeats + 1):
+        fresh = [(sizes.copy(), streams.copy()) for _ in range(lines)]
+        start = time.perf_counter()
+        for pair in fresh:
+            march(*pair, log_stress, n)
+        found.append((time.perf_counter() - start) / (lines * cells) * 1e9)
+    return found[1:]
+
+
+def rate(kernel, cells):
+    """Return the median nanoseconds per cell of a kernel that is told how often to pass over the cells."""
+    times, found = 20_000_000 // cells, []
+    for _ in range(REPEATS + 1):
+        start = time.perf_counter()
+        kernel(times)
+        found.append((time.perf_counter() - start) / (times * cells) * 1e9)
+    return statistics.median(found[1:])
+
+
+def check(line, n):
+    """Refuse to compare versions that do not give the same sizes and streams, bit for bit."""
+    results = []
+    for march in (bounded, compiled, vectorised):
+        sizes, streams = line[0].copy(), line[1].copy()
+        march(sizes, streams, line[2], n)
+        results.append((sizes, streams))
+    for sizes, streams in results[1:]:
+        assert np.array_equal(results[0][0], sizes) and np.array_equal(results[0][1], streams)  # noqa: PT018
+
+
+def processor():
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor()
+
+
+def main():
+    print(f"{processor()}, {os.cpu_count()} cores, one used; load {os.getloadavg()[0]:.1f} on start")
+    print(f"Python {platform.python_version()}, NumPy {np.__version__}, Numba {numba.__version__}")
+    print(f"medians (least) of {REPEATS} repeats, {PLAIN_REPEATS} of the plain versions; gamma = {GAMMA}\n")
+    lines = functools.cache(case)
+
+    print("| n | cells | " + " | ".join(f"{points} points" for points in POINTS) + " | 800 -> 1,600 |")
+    print("|---|---|" + "---|" * (len(POINTS) + 1))
+    for n in EXPONENTS:
+        for cells in CELLS:
+            found = [timed(bounded, lines(points, cells), cells, n, REPEATS) for points in POINTS]
+            medians = [statistics.median(times) for times in found]
+            row = [f"{median:.0f} ({min(times):.0f})" for median, times in zip(medians, found, strict=True)]
+            print(f"| {n} | {cells:,} | " + " | ".join(row) + f" | x {medians[4] / medians[3]:.2f} |", flush=True)
+    print("\nns per cell for the whole march\n")
+
+    print("| n | cells | plain NumPy | plain compiled loop |")
+    print("|---|---|---|---|")
+    for n in EXPONENTS:
+        for cells in CELLS:
+            line = lines(PLAIN_POINTS, cells)
+            check(line, n)
+            costs = [timed(march, line, cells, n, PLAIN_REPEATS) for march in (vectorised, compiled)]
+            row = [f"{statistics.median(times) / PLAIN_POINTS:.1f}" for times in costs]
+            print(f"| {n} | {cells:,} | " + " | ".join(row) + " |", flush=True)
+    print(f"\nns per cell and point, measured at {PLAIN_POINTS} points; sizes and streams bit for bit the kernel's\n")
+
+    print("| cells | read | compare | one compare of every cell at every one of 1,600 points |")
+    print("|---|---|---|---|")
+    for cells in CELLS:
+        sizes = lines(PLAIN_POINTS, cells)[0]
+        read = rate(functools.partial(_read, sizes.view(np.int32)), cells)
+        compare = rate(functools.partial(_compare, sizes, 0.0), cells)
+        print(f"| {cells:,} | {4 / read:.0f} GB/s | {1 / compare:.0f} per ns | {1600 * compare:.0f} ns per cell |")
+
+
+if __name__ == "__main__":
+    main()

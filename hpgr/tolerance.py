@@ -1,0 +1,214 @@
+"""Ask for an error instead of a grid: refine a scene until the estimated error of its results is small enough.
+
+The error of a run has two parts that are estimated apart. Bias, from time step and streamlines, shows when the
+grid is refined with the same random numbers; noise, from the number of cells, shows when the run is repeated with
+others. The estimate is |bias| + 2 standard errors, relative, for P80, the fraction below 1 mm and peak pressure.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hpgr import budget, pipeline, solve
+from hpgr.scene import Scene
+
+QUANTITIES = ("p80", "fineness", "peak_pressure")
+FINENESS_SIEVE = 1e-3  # m
+_LEAST_FINENESS = 0.05  # mass fraction; less is judged as if it were this much, or no error would be small enough
+
+_REPLICATES = 8  # of a pilot run; their scatter knows the noise to about a quarter
+_NOISE_SAFETY = 1.5  # for that quarter, and for taking noise to fall as 1 / sqrt(cells)
+_FIRST_POINTS = 51
+_SLOWEST = 0.85  # ratio of successive differences taken at most: n < 1 converges about so slowly
+_FASTEST = 0.5  # and at least, first order, whatever the figures seem to say
+_SAFETY = 1.5  # on differences that stand for a bias
+
+
+class Estimate(NamedTuple):
+    """A resolution and the error estimated for it.
+
+    Attributes
+    ----------
+    scene : Scene
+        The scene at the chosen resolution.
+    bias, noise : dict
+        By quantity, relative: what is left of bias, and one standard error.
+    pilot_seconds : float
+        Predicted cost of the runs that led here, s.
+    """
+
+    scene: Scene
+    bias: dict[str, float]
+    noise: dict[str, float]
+    pilot_seconds: float
+
+    def errors(self) -> dict[str, float]:
+        """Return bias + 2 standard errors by quantity, relative."""
+        return {name: self.bias[name] + 2 * self.noise[name] for name in self.bias}
+
+
+def refine(scene: Scene, tolerance: float, max_cost: float = 60.0, seed: int = 0) -> Estimate:
+    """Return the resolution at which the estimated error of `scene` is within `tolerance`.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is simulated; its streamlines are the fewest taken, its points and cells are chosen anew.
+    tolerance : float
+        Wanted relative error of P80, fraction below 1 mm and peak pressure; from 1e-4 to 0.5.
+    max_cost : float
+        Predicted seconds that pilot and final run may take together.
+    seed : int
+        Seed of the pilot runs.
+
+    Raises
+    ------
+    ValueError
+        If the tolerance is out of range, or cannot be met under `max_cost`; the message has the predicted cost.
+    """
+    if not 1e-4 <= tolerance <= 0.5:
+        raise ValueError(f"tolerance: got {tolerance!r}; must be within 1e-4 to 0.5; such as tolerance=0.01")
+    spent = _Purse(tolerance, max_cost)
+    record = scene.resolution.record
+    scene = scene.with_values({"resolution.photographs": 1})
+    coarse, bias_lines = _enough_streamlines(scene, tolerance / 4, spent)
+    coarse, bias_steps, scatter = _enough_points(coarse, tolerance / 2, spent, seed)
+    bias = {name: bias_lines[name] + bias_steps[name] for name in bias_steps}
+    cells = coarse.resolution.cells
+    if scatter:
+        room = {name: (tolerance - bias[name]) / 2 for name in scatter}
+        factor = max((_NOISE_SAFETY * scatter[name] / room[name]) ** 2 for name in scatter)
+        cells = max(100, math.ceil(cells * factor))
+    chosen = coarse.with_values({"resolution.cells": cells, "resolution.record": record})
+    shrink = math.sqrt(coarse.resolution.cells / cells) if cells else 0.0
+    noise = {name: _NOISE_SAFETY * scatter.get(name, 0.0) * shrink for name in bias}
+    spent.allow(budget.predict(chosen).seconds, chosen)
+    return Estimate(chosen, bias, noise, spent.seconds)
+
+
+class _Purse:
+    """What the runs so far were predicted to cost, held against the limit before each."""
+
+    def __init__(self, tolerance: float, max_cost: float):
+        self._tolerance, self._max_cost = tolerance, max_cost
+        self.seconds = 0.0
+
+    def allow(self, seconds: float, scene: Scene) -> None:
+        if self.seconds + seconds > self._max_cost:
+            grid = scene.resolution
+            raise ValueError(
+                f"tolerance: got {self._tolerance:g}; needs at least {grid.streamlines} streamlines x {grid.points} "
+                f"points x {grid.cells} cells, predicted to cost {self.seconds + seconds:,.1f} s, must be at most "
+                f"max_cost = {self._max_cost:g} s; raise max_cost or the tolerance"
+            )
+        self.seconds += seconds
+
+
+def _enough_streamlines(scene: Scene, wanted: float, spent: _Purse) -> tuple[Scene, dict[str, float]]:
+    """Return the scene with enough streamlines, and the bias they leave."""
+    while True:
+        lines = scene.resolution.streamlines
+        here, finer = (_smooth_figures(scene, count, 201, spent) for count in (lines, 2 * lines))
+        # midpoint rule, second order: 4/3 of the difference is the bias
+        bias = dict.fromkeys(QUANTITIES if scene.resolution.cells else QUANTITIES[-1:], 0.0)
+        bias |= {name: _SAFETY * 4 / 3 * abs(_relative(here, finer, name)) for name in here}
+        if max(bias.values()) <= wanted:
+            return scene, bias
+        scene = scene.with_values({"resolution.streamlines": 2 * lines})
+
+
+def _enough_points(scene: Scene, wanted: float, spent: _Purse, seed: int):
+    """Return the scene with enough points and pilot cells, the bias they leave, and the scatter of one pilot run.
+
+    The bias has two parts. Sampling the stress at points misses the sharp peak by an amount that depends on where
+    the points happen to lie; it is read off a much finer bed. Breaking once per step is what remains: its bias
+    falls steadily, and is read off the changes between grids with common random numbers.
+    """
+    cells = 0 if scene.resolution.cells == 0 else min(max(round(0.01 / wanted * 1000), 300), 30_000)
+    product = scene.with_values({"resolution.record": "product"})
+    if solve.choose(product) == solve.choose(scene):  # else cells are wanted of a scene whose product has a closed form
+        scene = product
+    points, runs, earlier = _FIRST_POINTS, [], None
+    while True:
+        one = scene.with_values({"resolution.points": points, "resolution.cells": cells})
+        sampling = _sampling_bias(one, spent)
+        if solve.choose(one) in ("stress only", "closed form"):
+            if max(sampling.values()) <= wanted:
+                return one, sampling, {}
+        else:
+            spent.allow(_REPLICATES * budget.predict(one).seconds, one)
+            prepared = pipeline.prepare(one)
+            runs.append([_figures(one, seed, replicate, prepared) for replicate in range(_REPLICATES)])
+            steps = {name: _step(runs[-2], runs[-1], name) for name in ("p80", "fineness")} if len(runs) > 1 else None
+            if earlier:
+                stepping = {name: _left(steps[name], earlier[name]) for name in steps}
+                bias = {name: sampling.get(name, 0.0) + stepping.get(name, 0.0) for name in QUANTITIES}
+                if max(bias.values()) <= wanted:
+                    return one, bias, _scatter(runs[-1])
+            earlier = steps
+        points = 2 * points - 1
+
+
+def _sampling_bias(scene: Scene, spent: _Purse) -> dict[str, float]:
+    lines, points = scene.resolution.streamlines, scene.resolution.points
+    finest = max(2 * points - 1, min(8 * points - 7, 12_801))
+    here, finer = (_smooth_figures(scene, lines, count, spent) for count in (points, finest))
+    return {name: _SAFETY * abs(_relative(here, finer, name)) for name in here}
+
+
+def _smooth_figures(scene: Scene, streamlines: int, points: int, spent: _Purse) -> dict[str, float]:
+    """Return the figures of a scene without cushioning and exchange, whose closed form has no noise.
+
+    The profile of stress across the gap and along the streamlines acts on both alike.
+    """
+    grid = {"resolution.streamlines": streamlines, "resolution.points": points, "resolution.record": "product"}
+    smooth = scene.with_values(grid | {"material.cushioning": math.inf, "exchange": None})
+    if solve.choose(smooth) == "march":  # strength without size effect has no closed form: judge the pressure
+        smooth = smooth.with_values({"resolution.cells": 0})
+    spent.allow(2.5e-3 + 2e-6 * streamlines * points, smooth)
+    return _figures(smooth, 0, 0, pipeline.prepare(smooth))
+
+
+def _step(coarse: list[dict], fine: list[dict], name: str) -> tuple[float, float]:
+    """Return the relative change from one grid to the next, and its standard error, over paired replicates."""
+    changes = np.array([_relative(a, b, name) for a, b in zip(coarse, fine, strict=True)])
+    error = changes.std(ddof=1) / math.sqrt(changes.size) if changes.size > 1 else 0.0
+    return float(changes.mean()), float(error)
+
+
+def _left(step: tuple[float, float], earlier: tuple[float, float]) -> float:
+    """Return the bias left after a refinement: the geometric tail of the changes, with the doubt about them."""
+    (change, error), (before, doubt) = step, earlier
+    ratio = (abs(change) + error) / max(abs(before) - doubt, 1e-30)
+    ratio = min(max(ratio, _FASTEST), _SLOWEST)
+    return (abs(change) + error) * ratio / (1 - ratio)
+
+
+def _scatter(runs: list[dict]) -> dict[str, float]:
+    """Return the relative standard deviation of one run, by quantity."""
+    found = {}
+    for name in runs[0]:
+        values = np.array([run[name] for run in runs])
+        scale = max(abs(values.mean()), _LEAST_FINENESS if name == "fineness" else 1e-300)
+        found[name] = float(values.std(ddof=1)) / scale
+    return found
+
+
+def _relative(a: dict, b: dict, name: str) -> float:
+    scale = max(abs(b[name]), _LEAST_FINENESS if name == "fineness" else 1e-300)
+    return (b[name] - a[name]) / scale
+
+
+def _figures(scene: Scene, seed: int, replicate: int, prepared: pipeline.Prepared) -> dict[str, float]:
+    return figures_of(pipeline.crush(scene, prepared, seed, replicate))
+
+
+def figures_of(values: dict[str, Any]) -> dict[str, float]:
+    """Return the judged figures among the variables of a run: P80 m, fraction below 1 mm, peak pressure Pa."""
+    found = {"peak_pressure": float(values["peak_pressure"])}
+    if values.get("p80_total") is not None:
+        found["p80"] = float(values["p80_total"])
+        logs = np.log(np.asarray(values["sieve"], dtype=float))
+        found["fineness"] = float(np.interp(math.log(FINENESS_SIEVE), logs, values["passing_total"]))
+    return found
