@@ -21,7 +21,7 @@ from hpgr import feed, flow, geometry, kernels, presets, stress
 POINTS = (100, 200, 400, 800, 1600, 3200)
 EXPONENTS = (0.5, 1.0, math.inf)
 CELLS = (1_000, 100_000)
-PLAIN_POINTS = 100  # the plain versions cost the same at every point
+PLAIN_POINTS = 200  # the plain versions cost the same at every point, but for the breaks
 CELLS_PER_TIMING = 100_000  # short lines are marched several times per timing
 REPEATS, PLAIN_REPEATS = 15, 3
 GAMMA = 1.0
@@ -41,6 +41,7 @@ def case(points, cells):
     return feed.draw(scene.feed, cells, seeds), streams, log_stress
 
 
+@functools.cache
 def material(n):
     """Return slope, cushion, strength size and size floor of the scene's material with exponent n."""
     scene = presets.paper()
@@ -89,6 +90,7 @@ def vectorised(sizes, streams, log_stress, n):
 
 
 def mixed(state):
+    """Return the output of SplitMix64 for an array of states."""
     z = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return z ^ (z >> np.uint64(31))

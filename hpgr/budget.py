@@ -36,16 +36,17 @@ def predict(scene: Scene) -> Cost:
         product = 4 * grid.photographs * lines * cells
         size += 3 * product + 40 * cells  # kept, pooled, sorted; and the work space of one line
         seconds += grid.photographs * lines * cells * (0.28e-6 + 0.15e-9 * points)
+        frames = grid.photographs
         if scene.exchange is not None:
-            parcels = lines * points * cells
-            size += 17 * parcels + 30_000 * lines * points  # sizes, streams, bounds; edges of the tessellation
+            frames += -(-(points - 1) // scene.exchange.interval) if scene.exchange.record_startup else 0
+            size += 17 * lines * points * cells + 30_000 * lines * points  # parcels; edges of the tessellation
             steps = points + grid.photographs * scene.exchange.interval
             seconds += 5e-5 * lines * points + steps * lines * points * (2e-6 + 1.5e-9 * cells)
         if grid.record == "cells":
-            size += product * points
-            seconds += 1e-9 * product * points / 4
+            size += 4 * frames * lines * points * cells
+            seconds += 1e-9 * frames * lines * points * cells
         elif grid.record == "distributions":
-            size += 16 * grid.photographs * lines * points * (len(grid.sieves) + 1)
+            size += 16 * frames * lines * points * (len(grid.sieves) + 1)
     return Cost(size, seconds)
 
 

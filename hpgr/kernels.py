@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numba import njit
 
-BLOCK = 16  # cells; 8, 16 and 32 differ by less than 10 % on the paper's scene (benchmarks/kernel.py)
+BLOCK = 16  # cells; on the paper's scene at 1,600 points 8 gains 5 % and 32 loses 20 %, at 200 points all are alike
 DENSE = 1 / 64  # swap probability of an edge from which deciding every cell is cheaper than skipping
 SMALLEST = 1e-30  # m; a fragment is never 0 nor denormal in float32, and counted as below the size floor
 
@@ -129,7 +129,7 @@ def crush(
         Bounds, see the module's head; updated.
     broken, active : uint32 (block x BLOCK + 1,), (block + 1,)
         Work space; on return the head of `broken` lists the cells that broke. Unsigned, or every index read from
-        them would be tested for being negative.
+        them would be tested for being negative (157 -> 149 ns a cell).
     sieves, counts : float64 (sieve,), int64 (sieve + 1,)
         Sieve classes to keep counted; none if `sieves` is empty.
     log_stress, reach_needed : float

@@ -112,7 +112,7 @@ class Lattice:
         self.most_passes = max(self.most_passes, most)
         crushing = np.isfinite(self._reach_needed.ravel())
         for number in range(most):
-            counter = step * exchange.MOST_PASSES + number + 1
+            counter = (step << 20) + number + 1  # unique: the passes of a step are far fewer than 2^20
             key = np.uint64(kernels.mix(np.uint64((self._swap_key + counter * 0xD1342543DE82EF95) % 2**64)))
             self.swaps += kernels.swap(
                 self.sizes, self.streams, self._reach, self._block_reach, self._stale, self._largest, slots, crushing,

@@ -58,20 +58,17 @@ def tessellate(scene: Scene, geometry: Geometry, motion: Motion) -> Tessellation
     """
     x, y = motion.x, motion.y
     rim = flow.move(scene, geometry._replace(xi=np.array([0.0, 1.0])), y.shape[1]).y[:, 0]
-    domain = _domain(geometry, x, y, rim)
     points = np.column_stack([x.ravel(), y.ravel()])
-    whole = shapely.get_parts(
-        shapely.voronoi_polygons(
-            shapely.multipoints(points), extend_to=domain.buffer(0.1 * domain.length), ordered=True
-        )
-    )
-    if whole.size != len(points):
-        raise ValueError(_lost(f"{len(points) - whole.size} of {len(points)} points have no cell"))
-    pairs, ends = _shared_edges(whole)
-    length = _length_within(domain, ends)
+    try:
+        domain = _domain(geometry, x, y, rim)
+        whole = _voronoi(points, domain)
+        pairs, ends = _shared_edges(whole)
+        length = _length_within(domain, ends)
+        cells = _clipped(domain, whole)
+    except shapely.errors.GEOSException as error:  # how the library tells of points that it cannot tell apart
+        raise ValueError(_lost(str(error))) from None
     kept = length > 0
     pairs, length = pairs[kept], length[kept]
-    cells = _clipped(domain, whole)
     volume = shapely.area(cells)
     excess = abs(volume.sum() / domain.area - 1)
     if not excess <= _CLOSED or not (volume > 0).all():
@@ -94,6 +91,15 @@ def _domain(geometry: Geometry, x: np.ndarray, y: np.ndarray, rim: np.ndarray) -
     outer = np.column_stack([geometry.outer(heights), heights])
     entry = np.column_stack([x[:, 0], y[:, 0]])
     return shapely.Polygon(np.concatenate([[[0.0, 0.0], [0.0, rim[0]]], entry, outer]))
+
+
+def _voronoi(points: np.ndarray, domain: shapely.Polygon) -> np.ndarray:
+    """Return the Voronoi cells of the points, in their order, beyond the domain."""
+    around = domain.buffer(0.1 * domain.length)
+    cells = shapely.get_parts(shapely.voronoi_polygons(shapely.multipoints(points), extend_to=around, ordered=True))
+    if cells.size != len(points):
+        raise ValueError(_lost(f"{len(points) - cells.size} of {len(points)} points have no cell"))
+    return cells
 
 
 def _shared_edges(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -298,11 +298,21 @@ def ladder_errors(panel, result: xr.Dataset, name: str, title: str) -> None:
     if highest > 0:  # a scene in which nothing changes has nothing to draw
         panel.set_yscale("log")
         panel.set_ylim(1e-3 * highest, 6 * highest)
-    for rung, where in zip(rungs, milliseconds, strict=True):
-        panel.annotate(str(rung), (where, 0.985), xycoords=("data", "axes fraction"), rotation=90, fontsize=8,
-                       ha="center", va="top")  # fmt: skip
+    _number_rungs(panel, rungs, milliseconds)
     panel.grid(color="0.9", which="both")
     _plain_numbers(panel)
+
+
+def _number_rungs(panel, rungs: np.ndarray, places: np.ndarray) -> None:
+    """Write the rungs along the upper edge, each at its place; of those that would overlap only the first."""
+    low, high = np.log(panel.get_xlim())
+    across = (np.log(places) - low) / (high - low)
+    taken: list[float] = []
+    for rung, where, place in zip(rungs, places, across, strict=True):
+        if all(abs(place - other) > 0.05 for other in taken):
+            taken.append(place)
+            panel.annotate(str(rung), (where, 0.985), xycoords=("data", "axes fraction"), rotation=90, fontsize=8,
+                           ha="center", va="top")  # fmt: skip
 
 
 def _plain_numbers(panel) -> None:

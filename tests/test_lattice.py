@@ -562,7 +562,6 @@ def test_predicted_memory_of_the_lattice_is_that_of_its_arrays():
     assert budget.predict(small()).bytes < budget.predict(mixed()).bytes
 
 
-@pytest.mark.xfail(reason="budget.predict counts the steady photographs only, not those of the start-up")
 def test_predicted_memory_counts_the_start_up_photographs():
     for record, part in (("cells", "size"), ("distributions", "mass_fraction")):
         scene = mixed({"exchange.record_startup": True, "exchange.interval": 1, "resolution.record": record})

@@ -205,9 +205,6 @@ def test_volumes_do_not_depend_on_speed():
 # --- refused -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.xfail(
-    raises=shapely.errors.GEOSException, reason="tessellate lets GEOS's own exception through, which is no ValueError"
-)
 def test_points_that_coincide_are_refused():
     scene = scene_of()
     bed, motion = laid(scene)
@@ -235,9 +232,6 @@ def test_lost_points_are_refused(monkeypatch):
         tiled(scene_of())
 
 
-@pytest.mark.xfail(
-    raises=shapely.errors.GEOSException, reason="tessellate lets GEOS's own exception through, which is no ValueError"
-)
 def test_a_gap_below_double_precision_is_refused_or_tiled():
     """At some gap, neighbours on the exit row are one point to GEOS: an error, never a silent hole."""
     outcomes = set()
