@@ -426,6 +426,7 @@ _AXES = {
 
 
 def _attributes(scene: Scene, plan: Plan, seed: int) -> dict[str, Any]:
+    import os
     import platform
     from importlib.metadata import version
 
@@ -448,8 +449,9 @@ def _attributes(scene: Scene, plan: Plan, seed: int) -> dict[str, Any]:
         "safety_factor": SAFETY,
         "orders_held_within": list(ORDERS),
         "scale": f"errors are relative to the reference; below 1 mm to at least {_LEAST_PERCENT:g} %; 0 counts as 1",
-        "wall_time": "geometry, stress, crushing and summary of one run; hpgr.simulate adds its Dataset, about 1 ms",
-        "machine": f"{platform.machine()}, Python {platform.python_version()}",
+        "wall_time": "geometry, stress, crushing and summary of one run, large ones on all cores; "
+        "hpgr.simulate adds its Dataset, about 1 ms",
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
         "versions": ", ".join(f"{name} {version(name)}" for name in libraries),
     }
 
