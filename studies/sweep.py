@@ -28,6 +28,7 @@ STATUS = {"ok": 0, "refused": 1, "failed": 2}  # refused: bad input; failed: any
 # Names of the dims of the main axes (design page); others are called after their field.
 _DIMS = {"rolls.gap": "gap", "rolls.speed": "roll_speed", "feed.top_size": "feed_top_size"}
 _BATCH = 32  # cases a task holds at most: dask's cost of about 1 ms per task is then under 1 % of a case's
+_BATCH_SECONDS = 2.0  # predicted for a task at most, so that progress shows and little is lost with a worker
 
 
 class Case(NamedTuple):
@@ -103,8 +104,9 @@ def sweep(
     """
     grid = axis_values(axes)
     refuse_key("seed", seed)
-    if replicates < 1:
-        raise ValueError(f"replicates: got {replicates}; must be at least 1; such as replicates=3")
+    for name, value in {"replicates": replicates, "threads": threads}.items():
+        if value < 1:
+            raise ValueError(f"{name}: got {value}; must be at least 1; such as {name}=2")
     base = scene.with_values({"resolution.record": "product"})
     cases = list(enumerate_cases(grid, replicates))
     outcomes = _outcomes((base, seed, tolerance), cases, client, threads, progress)
@@ -232,7 +234,8 @@ def _outcomes(bench_of, cases, client, threads, progress) -> Iterator[Outcome]:
             yield from _outcomes(bench_of, cases, own, threads, progress)
         return
     workers = max(1, sum(client.nthreads().values()))
-    size = min(_BATCH, max(1, len(cases) // (4 * workers)))
+    quick = int(_BATCH_SECONDS / budget.predict(bench_of[0]).seconds)
+    size = max(1, min(_BATCH, quick, len(cases) // (4 * workers)))
     batches = [cases[start : start + size] for start in range(0, len(cases), size)]
     futures = client.map(_run_batch, [bench_of] * len(batches), batches, pure=False)
     sent = dict(zip(futures, batches, strict=True))
