@@ -783,7 +783,12 @@ def _choice_table(result) -> Table:
         rows.append([f"cheapest within {100 * target:g} %", *(blank if k is None else _combination_row(result, k))])
     for k in np.flatnonzero(result["combination_level"].values != ""):
         rows.append([f"level {result['combination_level'].values[k]}", *_combination_row(result, k)])
-    return Table("Which resolution (worst of P50, P80, below 1 mm)", ["", *_COMBINATION], rows)
+    index, error = (result[f"reference_{key}"].values[:_SAMPLED].max() for key in ("convergence_index", "error"))
+    title = (
+        "Which resolution (worst of P50, P80, below 1 mm; the reference itself: grid convergence index "
+        f"{_percent(index)} %, standard error {_percent(error)} %)"
+    )
+    return Table(title, ["", *_COMBINATION], rows)
 
 
 def _write(result: "xr.Dataset", options: Options) -> list[Path]:

@@ -9,7 +9,7 @@ import xarray as xr
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import FixedLocator, NullFormatter
 
 from hpgr import units
 from hpgr.flow import Motion
@@ -248,7 +248,7 @@ def accuracy_figure(result: xr.Dataset) -> Figure:
 def work_precision(panel, result: xr.Dataset) -> None:
     """Draw the error of every combination against its wall time, the Pareto front, and the named levels."""
     milliseconds = 1e3 * result["combination_wall_time"].values
-    error = 100 * result["combination_worst_error"].values
+    error = np.maximum(100 * result["combination_worst_error"].values, 1e-4)  # none at all has no place on log axes
     lines, points = result["combination_streamlines"].values, result["combination_points"].values
     every = np.unique(points)
     for k, count in enumerate(np.unique(lines)):
@@ -268,9 +268,10 @@ def work_precision(panel, result: xr.Dataset) -> None:
     for k in np.flatnonzero(result["combination_level"].values != ""):
         where = (milliseconds[k], error[k])
         panel.plot(*where, marker="o", markersize=15, fillstyle="none", color="black", markeredgewidth=1.6)
-        panel.annotate(str(result["combination_level"].values[k]), where, (12, 10), textcoords="offset points",
-                       fontweight="bold", bbox={"facecolor": "white", "edgecolor": "none", "pad": 1})  # fmt: skip
+        panel.annotate(str(result["combination_level"].values[k]), where, (55, 28), textcoords="offset points",
+                       fontweight="bold", arrowprops={"arrowstyle": "-", "shrinkB": 8})  # fmt: skip
     panel.set(xscale="log", yscale="log", xlabel="median wall time of a run [ms]")
+    panel.set_ylim(0.8 * error.min(), 2 * error.max())
     panel.set_ylabel("largest error of P50, P80 and percent below 1 mm: |bias| + 2 standard errors [%]")
     panel.set_title("Work and precision: streamlines N, points P, cells M")
     panel.grid(color="0.9", which="both")
@@ -292,7 +293,7 @@ def ladder_errors(panel, result: xr.Dataset, name: str, title: str) -> None:
         panel.plot(milliseconds[seen], values[seen], marker=marker, linestyle=dash, color=lightness, label=label,
                    markersize=4.5, linewidth=1.2)  # fmt: skip
         highest = max(highest, values[seen].max(initial=0.0))
-    panel.set(xscale="log", title=title)
+    panel.set(xscale="log", title=title, xlim=(milliseconds.min() / 1.1, milliseconds.max() * 1.1))
     panel.set_xlabel("wall time of a run [ms]", labelpad=1)
     panel.set_ylabel("error [%]")
     if highest > 0:  # a scene in which nothing changes has nothing to draw
@@ -316,9 +317,13 @@ def _number_rungs(panel, rungs: np.ndarray, places: np.ndarray) -> None:
 
 
 def _plain_numbers(panel) -> None:
-    """Write 0.1, 1, 10 along log axes, and thin what is between."""
-    for axis, scale in ((panel.xaxis, panel.get_xscale()), (panel.yaxis, panel.get_yscale())):
-        if scale == "log":
-            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    """Write 0.1, 0.2, 0.5, 1 along log axes, and numbers between them along short ones."""
+    for axis in (panel.xaxis, panel.yaxis):
+        if axis.get_scale() == "log":
+            low, high = axis.get_view_interval()
+            steps = (1, 2, 5) if high > 5 * low else (1, 1.5, 2, 3, 4, 5, 6, 8)
+            decades = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))))
+            axis.set_major_locator(FixedLocator([step * 10.0**k for k in decades for step in steps]))
             axis.set_major_formatter("{x:g}")
             axis.set_minor_formatter(NullFormatter())
+            axis.set_view_interval(low, high, ignore=True)

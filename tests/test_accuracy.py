@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 import xarray as xr
-from support import SIGMAS, paper
+from support import SIGMAS, feed_values, paper
 
 from hpgr import kernels, parcels, pipeline
 from studies import accuracy, plots
@@ -183,6 +183,21 @@ def test_flat_bed_and_half_cushioning():
     assert (result["points_bias"].sel(quantity="peak_pressure") == 0).all()
     assert result["variant"].values.tolist() == ["scene", "euler"]
     draw(result)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"material.cushioning": "inf"},  # closed form: no noise
+        {"material.strength": "1e14 Pa"} | feed_values(kind="single", size=0.02),  # no error of any kind
+    ],
+)
+def test_scenes_without_noise(values):
+    result = accuracy.study(paper(values), TINY)
+    assert (result["cells_noise"] == 0).all()
+    assert np.isnan(result["cells_noise_exponent"]).all()
+    draw(result)
+    assert "-" in accuracy.in_words(accuracy.short_tables(result), markdown=False)
 
 
 def test_without_size_effect_there_is_no_closed_form():
