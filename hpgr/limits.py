@@ -11,6 +11,7 @@ import numpy as np
 from hpgr import feed as feeds
 from hpgr.scene import Feed, Material
 
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(200)  # made once: they cost more than the rest of a case
 _FINEST = 1e-30  # m, below any grain; where percentiles are searched from
 
 
@@ -41,10 +42,10 @@ def crushed_passing(feed: Feed, size, critical, gamma: float) -> np.ndarray:
     return np.where(size < critical, feeds.passing(feed, size) + crushed, 1.0)
 
 
-def percentile(passing, fraction: float, coarsest: float, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the sizes in m, of the given shape, at which the rising function `passing` reaches `fraction`."""
-    low, high = np.full(shape, np.log(_FINEST)), np.full(shape, np.log(coarsest))
-    for _ in range(60):  # halves 70 nepers to rounding
+def percentile(passing, fraction, coarsest: float) -> np.ndarray:
+    """Return the sizes in m at which the rising function `passing` reaches `fraction`, in the shape of the latter."""
+    low, high = np.full_like(fraction, np.log(_FINEST)), np.full_like(fraction, np.log(coarsest))
+    for _ in range(52):  # halves 70 nepers to rounding
         middle = (low + high) / 2
         above = passing(np.exp(middle)) >= fraction
         low, high = np.where(above, low, middle), np.where(above, middle, high)
@@ -58,9 +59,8 @@ def expected_breaks(feed: Feed, critical, gamma: float) -> np.ndarray:
     """
     critical = np.asarray(critical, dtype=float)
     start = np.log(np.minimum(critical, feed.coarsest))
-    nodes, weights = np.polynomial.legendre.leggauss(200)
     length = np.log(feed.coarsest) - start
-    size = np.exp(start[..., None] + length[..., None] * (nodes + 1) / 2)
-    tail = (1 - feeds.passing(feed, size)) @ (weights / 2) * length
+    size = np.exp(start[..., None] + length[..., None] * (_NODES + 1) / 2)
+    tail = (1 - feeds.passing(feed, size)) @ (_WEIGHTS / 2) * length
     reached = critical <= feed.coarsest
     return np.where(reached, 1 - feeds.passing(feed, np.minimum(critical, feed.coarsest)) + gamma * tail, 0.0)

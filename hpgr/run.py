@@ -73,8 +73,8 @@ def simulate(
 
 def _attributes(scene: Scene, seed: int, replicate: int, prepared: Prepared) -> dict[str, Any]:
     level = scene.resolution.level
-    measured = {} if level == "custom" else {"level": f"{level}: {LEVELS[level].measured}"}
-    return measured | {
+    told = "" if level == "custom" else f"{level}: {LEVELS[level].measured}, measured on the paper's scene"
+    return ({"level": told} if told else {}) | {
         "Conventions": "CF-1.11",
         "title": "Comminution in high pressure grinding rolls, heterarchical model",
         "source": f"hpgr {__version__}",

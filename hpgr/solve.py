@@ -125,7 +125,10 @@ def _closed_form(scene: Scene, log_stress: np.ndarray) -> Crushed:
     def passing(size):
         return limits.crushed_passing(scene.feed, size, at_exit, ore.fragment_exponent)
 
-    coarsest = scene.feed.coarsest
+    def total_passing(size):
+        return passing(size).mean(axis=1, keepdims=True)
+
+    coarsest, fractions = scene.feed.coarsest, np.array(FRACTIONS)[:, None]
     mass = None
     if grid.record == "distributions":
         everywhere = limits.crushed_passing(scene.feed, sieves, critical[..., None], ore.fragment_exponent)
@@ -134,10 +137,8 @@ def _closed_form(scene: Scene, log_stress: np.ndarray) -> Crushed:
         breaks=limits.expected_breaks(scene.feed, at_exit, ore.fragment_exponent),
         below_floor=passing(np.nextafter(ore.size_floor, 0.0)),
         passing=limits.crushed_passing(scene.feed, sieves, at_exit[:, None], ore.fragment_exponent),
-        percentiles=np.stack([limits.percentile(passing, f, coarsest, at_exit.shape) for f in FRACTIONS]),
-        total_percentiles=np.stack(
-            [limits.percentile(lambda size: passing(size).mean(), f, coarsest, ()) for f in FRACTIONS]
-        ),
+        percentiles=limits.percentile(passing, np.tile(fractions, at_exit.size), coarsest),
+        total_percentiles=limits.percentile(total_passing, fractions, coarsest)[:, 0],
         mass_fraction=mass,
     )
 

@@ -106,14 +106,18 @@ def crushing_stress(scene: Scene, motion: Motion, state: Load) -> np.ndarray:
 
 
 def _euler_increments(material, motion, compacting, eps_v, eps_s, phi):
-    """Return the increments of p and q by eq. 4 with the rates and state at the start of each step."""
+    """Return the increments of p and q by eq. 4 with the state at the start of each step.
+
+    The shear rate is that of the elastic shear strain: what the convexity limit has taken as plastic loads nothing.
+    """
     c, bulk, shear = material.elastic_exponent, material.bulk_modulus, material.shear_modulus
     eta = _ratio(eps_s, eps_v)
-    scale = np.where(compacting, phi**3 * _power(eps_v, c), 0.0) * motion.time_step
-    rate_v, rate_s = motion.volumetric_rate, motion.shear_rate
-    d_p = scale * ((bulk + 1.5 * shear * c * (c - 1) * eta**2) * rate_v + 3 * shear * c * eta * rate_s)
-    d_q = scale * 3 * shear * (c * eta * rate_v + rate_s)
-    return d_p[:, :-1], d_q[:, :-1]
+    scale = np.where(compacting, phi**3 * _power(eps_v, c), 0.0)
+    scale, eta = scale[:, :-1], eta[:, :-1]
+    d_v, d_s = motion.volumetric_rate[:, :-1] * motion.time_step, np.diff(eps_s, axis=1)
+    d_p = scale * ((bulk + 1.5 * shear * c * (c - 1) * eta**2) * d_v + 3 * shear * c * eta * d_s)
+    d_q = scale * 3 * shear * (c * eta * d_v + d_s)
+    return d_p, d_q
 
 
 def _trapezoid(rate, compacting, step):

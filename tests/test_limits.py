@@ -76,7 +76,7 @@ def test_percentile_inverts_the_closed_form(name, fraction):
     def law(size):
         return limits.crushed_passing(FEEDS[name], size, np.array([0.002, 0.02]), 0.7)
 
-    found = limits.percentile(law, fraction, 0.06, (2,))
+    found = limits.percentile(law, np.full(2, fraction), 0.06)
     assert found.shape == (2,)
     assert law(found) == pytest.approx(fraction, rel=1e-9)
 
@@ -85,13 +85,13 @@ def test_percentiles_of_a_power_law_product():
     """A1: P80 = 0.8^(1/gamma) s_c."""
     for gamma in (0.35, 1.0, 4.0):
         found = limits.percentile(
-            lambda size, gamma=gamma: limits.crushed_passing(FEEDS["single"], size, 0.004, gamma), 0.8, 0.06, ()
+            lambda size, gamma=gamma: limits.crushed_passing(FEEDS["single"], size, 0.004, gamma), np.array(0.8), 0.06
         )
         assert found == pytest.approx(0.8 ** (1 / gamma) * 0.004, rel=1e-12)
 
 
 def test_percentile_of_a_step_is_the_step():
-    found = limits.percentile(lambda size: limits.crushed_passing(FEEDS["single"], size, INF, 1.0), 0.5, 0.06, ())
+    found = limits.percentile(lambda size: limits.crushed_passing(FEEDS["single"], size, INF, 1.0), np.array(0.5), 0.06)
     assert found == pytest.approx(0.06, rel=1e-12)
 
 

@@ -336,3 +336,20 @@ def test_moduli_times_8_give_pressures_times_8(integrator):
     assert np.array_equal(stiff_state.pressure, 8 * soft_state.pressure)
     assert np.array_equal(stiff_state.shear_stress, 8 * soft_state.shear_stress)
     assert np.array_equal(stiff_state.on_shear_limit, soft_state.on_shear_limit)
+
+
+@pytest.mark.parametrize("preset", [presets.paper, presets.khd_pilot])
+def test_euler_tends_to_the_limit_of_increment_with_shear_on_its_limit(preset):
+    # the total shear rate in place of the elastic one would tend to 27.39 against 26.65 MPa on the paper's machine,
+    # and to 6.93 against 3.85 MPa on the pilot rolls
+    def peak(integrator, points):
+        scene = preset().with_values({"stress.integrator": integrator, "resolution.points": points})
+        motion = flow.move(scene, geometry.bed(scene.rolls, 2), points)
+        state = stress.load(scene, motion)
+        assert state.on_shear_limit.any()
+        return state.pressure.max()
+
+    limit = peak("increment", 12_801)
+    coarse, fine = (abs(peak("euler", points) / limit - 1) for points in (801, 6401))
+    assert fine < 1e-3
+    assert fine < coarse / 4  # first order would be 8
