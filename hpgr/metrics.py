@@ -44,6 +44,8 @@ def passing(dataset: xr.Dataset, sieves=None, point: int = -1, total: bool = Fal
     1.0
     """
     _require_sizes(dataset)
+    if sieves is not None and not (np.asarray(sieves, dtype=float) > 0).all():
+        raise ValueError(f"sieves: got {sieves!r}; must be sizes above 0 in m; such as [0.001]")
     if "size" in dataset:
         wanted = dataset["sieve"].values if sieves is None else np.atleast_1d(np.asarray(sieves, dtype=float))
         as_cells = wanted.astype(np.float32)  # a grain of just a sieve's size passes it
@@ -55,6 +57,7 @@ def passing(dataset: xr.Dataset, sieves=None, point: int = -1, total: bool = Fal
         if sieves is not None:
             found = _between_sieves(found, np.atleast_1d(np.asarray(sieves, dtype=float)))
     found.attrs = {"units": "1", "long_name": "mass fraction passing"}
+    found = found.rename("passing")
     return found.mean("streamline", keep_attrs=True) if total else found
 
 
@@ -115,8 +118,19 @@ def peak_pressure(dataset: xr.Dataset, total: bool = False) -> xr.Dataset:
 def reduction_ratio(dataset: xr.Dataset, percent: float = 80, total: bool = False) -> xr.DataArray:
     """Return feed size over product size at `percent` % passing, such as F80/P80, 1.
 
-    The feed is that of `dataset.attrs["scene"]`, so the Dataset must come from `hpgr.simulate`.
+    The feed is that of `dataset.attrs["scene"]`.
+
+    Raises
+    ------
+    ValueError
+        If the Dataset is of a sweep over the feed, whose scene has one feed only.
     """
+    swept = [name for name, axis in dataset.coords.items() if axis.attrs.get("scene_field", "").startswith("feed.")]
+    if swept:
+        raise ValueError(
+            f"the Dataset sweeps {swept[0]}, but holds the feed of its base scene only; take hpgr.feed.quantile of "
+            "each feed over hpgr.percentile_size instead"
+        )
     scene = Scene.model_validate_json(dataset.attrs["scene"])
     ratio = feed.quantile(scene.feed, percent / 100) / percentile_size(dataset, percent, total=total)
     ratio.attrs = {"units": "1", "long_name": f"reduction ratio F{percent:g}/P{percent:g}"}
@@ -199,6 +213,8 @@ def _percentile_between_sieves(found: xr.DataArray, fraction: float, total: bool
     log_sieves = np.log(found["sieve"].values)
 
     def invert(fractions):
+        if np.isnan(fractions).any():  # a case of a sweep that holds no result
+            return np.nan
         if not fractions[0] <= fraction <= fractions[-1]:
             raise ValueError(
                 f"percent: got {fraction:.0%}; the recorded sieves pass {fractions[0]:.3%} to {fractions[-1]:.3%}; "

@@ -165,8 +165,9 @@ def _notes(scene: Scene, bed: geometry.Geometry, state: stress.Load, crushed: so
     notes = {}
     ore, rolls = scene.material, scene.rolls
     needed = float(state.continuity_solid_fraction.max())
-    if bed.height == 0:
-        notes["no_compaction"] = "the gap equals the entry gap: nothing is compacted, the product is the feed"
+    if not state.pressure.any():
+        why = "the gap equals the entry gap" if bed.height == 0 else "the bed only dilates on its way to the gap"
+        notes["no_compaction"] = f"{why}: nothing is compacted nor pressed, the product is the feed"
     if needed > ore.max_solid_fraction:
         notes["solid_fraction_capped"] = (
             f"mass continuity would need a solid fraction of {needed:.3g} at the exit; "

@@ -11,7 +11,7 @@ from hpgr import __version__, budget, pipeline, schema, solve
 from hpgr import tolerance as tolerances
 from hpgr.keys import refuse_key
 from hpgr.pipeline import Prepared
-from hpgr.scene import LEVELS, Scene
+from hpgr.scene import Scene, level_text
 
 
 def simulate(
@@ -59,22 +59,21 @@ def simulate(
     """
     refuse_key("seed", seed)
     refuse_key("replicate", replicate)
-    errors = {}
+    chosen = {}
     if tolerance is not None:
         estimate = tolerances.refine(scene, tolerance, max_cost, seed)
-        scene, errors = estimate.scene, estimate.errors()
+        scene, chosen = estimate.scene, estimate.variables()
     budget.refuse_too_large(scene)
     prepared = pipeline.prepare(scene)
     values = pipeline.crush(scene, prepared, seed, replicate)
     notes = values.pop("notes")
-    values |= {schema.ERRORS[name]: error for name, error in errors.items()}
+    values |= chosen
     return schema.to_dataset(values, _attributes(scene, seed, replicate, prepared) | {"notes": notes})
 
 
 def _attributes(scene: Scene, seed: int, replicate: int, prepared: Prepared) -> dict[str, Any]:
-    level = scene.resolution.level
-    told = "" if level == "custom" else f"{level}: {LEVELS[level].measured}, measured on the paper's scene"
-    return ({"level": told} if told else {}) | {
+    return {
+        "level": level_text(scene.resolution.level),
         "Conventions": "CF-1.11",
         "title": "Comminution in high pressure grinding rolls, heterarchical model",
         "source": f"hpgr {__version__}",

@@ -547,6 +547,11 @@ LEVELS = {
 }
 
 
+def level_text(level: str) -> str:
+    """Return a level with its measured error and cost, for a reader of results."""
+    return level if level == "custom" else f"{level}: {LEVELS[level].measured}, measured on the paper's scene"
+
+
 _LEVEL_FIELDS = ("streamlines", "points", "cells")
 
 

@@ -2,6 +2,7 @@
 
 import math
 import os
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from typing import NamedTuple
@@ -165,7 +166,9 @@ def _march(scene: Scene, log_stress: np.ndarray, seed: int, replicate: int) -> C
 
     breaks = np.zeros(shape[1])
     columns = list(np.ndindex(*shape[:2]))
-    threads = os.cpu_count() if product.size >= _LARGE else 1
+    # only for a caller of hpgr.simulate: the worker threads of a study have the cores already
+    alone = threading.current_thread() is threading.main_thread()
+    threads = os.cpu_count() if alone and product.size >= _LARGE else 1
     with ThreadPoolExecutor(threads) if threads > 1 else nullcontext() as pool:
         found = (pool.map if pool else map)(lambda column: march(*column), columns)
         for (_, line), count in zip(columns, found, strict=True):

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hpgr import budget, pipeline, solve
+from hpgr import budget, pipeline, schema, solve
 from hpgr.scene import Scene
 
 QUANTITIES = ("p80", "fineness", "peak_pressure")
@@ -47,6 +47,12 @@ class Estimate(NamedTuple):
         """Return bias + 2 standard errors by quantity, relative."""
         return {name: self.bias[name] + 2 * self.noise[name] for name in self.bias}
 
+    def variables(self) -> dict[str, float]:
+        """Return errors and resolution under the names they have in a Dataset."""
+        grid = self.scene.resolution
+        used = {"streamlines_used": grid.streamlines, "points_used": grid.points, "cells_used": grid.cells}
+        return {schema.ERRORS[name]: error for name, error in self.errors().items()} | used
+
 
 def refine(scene: Scene, tolerance: float, max_cost: float = 60.0, seed: int = 0) -> Estimate:
     """Return the resolution at which the estimated error of `scene` is within `tolerance`.
@@ -54,7 +60,8 @@ def refine(scene: Scene, tolerance: float, max_cost: float = 60.0, seed: int = 0
     Parameters
     ----------
     scene : Scene
-        What is simulated; its streamlines are the fewest taken, its points and cells are chosen anew.
+        What is simulated; its streamlines are the fewest taken, its points and cells are chosen anew. More than
+        one photograph makes the noise smaller than estimated.
     tolerance : float
         Wanted relative error of P80, fraction below 1 mm and peak pressure; from 1e-4 to 0.5.
     max_cost : float
@@ -70,7 +77,7 @@ def refine(scene: Scene, tolerance: float, max_cost: float = 60.0, seed: int = 0
     if not 1e-4 <= tolerance <= 0.5:
         raise ValueError(f"tolerance: got {tolerance!r}; must be within 1e-4 to 0.5; such as tolerance=0.01")
     spent = _Purse(tolerance, max_cost)
-    record = scene.resolution.record
+    kept = {f"resolution.{name}": getattr(scene.resolution, name) for name in ("record", "photographs")}
     scene = scene.with_values({"resolution.photographs": 1})
     coarse, bias_lines = _enough_streamlines(scene, tolerance / 4, spent)
     coarse, bias_steps, scatter = _enough_points(coarse, tolerance / 2, spent, seed)
@@ -80,7 +87,7 @@ def refine(scene: Scene, tolerance: float, max_cost: float = 60.0, seed: int = 0
         room = {name: (tolerance - bias[name]) / 2 for name in scatter}
         factor = max((_NOISE_SAFETY * scatter[name] / room[name]) ** 2 for name in scatter)
         cells = max(100, math.ceil(cells * factor))
-    chosen = coarse.with_values({"resolution.cells": cells, "resolution.record": record})
+    chosen = coarse.with_values({"resolution.cells": cells, **kept})
     shrink = math.sqrt(coarse.resolution.cells / cells) if cells else 0.0
     noise = {name: _NOISE_SAFETY * scatter.get(name, 0.0) * shrink for name in bias}
     spent.allow(budget.predict(chosen).seconds, chosen)
@@ -95,7 +102,7 @@ class _Purse:
         self.seconds = 0.0
 
     def allow(self, seconds: float, scene: Scene) -> None:
-        if self.seconds + seconds > self._max_cost:
+        if not self.seconds + seconds <= self._max_cost:
             grid = scene.resolution
             raise ValueError(
                 f"tolerance: got {self._tolerance:g}; needs at least {grid.streamlines} streamlines x {grid.points} "

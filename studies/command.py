@@ -40,11 +40,11 @@ def shown_as(metavar: str):
 class Options:
     """Options of a sweep; quantities are text with a unit, such as "60 mm" or "19 rpm"."""
 
-    gap: Annotated[tuple[str, ...], shown_as("LENGTH ...")] = ()
+    gap: Annotated[tuple[str, ...] | None, shown_as("LENGTH ...")] = None
     """Gaps to sweep, such as --gap "40 mm" "60 mm"."""
-    roll_speed: Annotated[tuple[str, ...], shown_as("SPEED ...")] = ()
+    roll_speed: Annotated[tuple[str, ...] | None, shown_as("SPEED ...")] = None
     """Roll speeds to sweep, such as --roll-speed "15 rpm" "19 rpm"."""
-    feed_top_size: Annotated[tuple[str, ...], shown_as("LENGTH ...")] = ()
+    feed_top_size: Annotated[tuple[str, ...] | None, shown_as("LENGTH ...")] = None
     """Top sizes of the feed to sweep, such as --feed-top-size "40 mm" "60 mm"."""
     scene: Annotated[str, shown_as("PRESET|FILE")] = "paper"
     """Base scene: a preset (paper, khd_pilot), or the path of a .toml or .json scene file."""
@@ -60,6 +60,8 @@ class Options:
     """Streamlines from the mid-plane to the roll (default: the scene's)."""
     tolerance: Annotated[float | None, shown_as("X")] = None
     """Relative error wanted, such as 0.01: every operating point is refined until its estimate is below it."""
+    max_cost: Annotated[float, shown_as("SECONDS")] = 60.0
+    """Predicted time that meeting the tolerance may take at an operating point."""
     sieve: Annotated[str, shown_as("LENGTH")] = "1 mm"
     """Sieve whose percent passing is shown."""
     workers: Annotated[int, shown_as("N")] = 2
@@ -67,7 +69,7 @@ class Options:
     scheduler: Annotated[str | None, shown_as("ADDRESS")] = None
     """Running dask scheduler to use instead, such as tcp://127.0.0.1:8786."""
     exchange: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Switch on segregation and mixing between streamlines, if the scene does not say how with their defaults."""
+    """Switch on segregation and mixing between streamlines, as the scene says, or else with default strength."""
     seed: Annotated[int, shown_as("N")] = 0
     """Seed of all randomness; the same seed gives the same bits."""
     out: Annotated[Path | None, shown_as("FILE")] = None
@@ -111,12 +113,29 @@ def run(study: Study, arguments: Sequence[str] | None = None) -> int:
     if min(options.workers, options.replicates) < 1:
         raise ValueError(f"got --workers {options.workers} --replicates {options.replicates}; both must be at least 1")
     refuse_key("--seed", options.seed)
+    _check_tolerance(options)
     if options.dry_run:
         _print_cases(scene, axes, options)
         return 0
+    from studies import store
+
+    out = _out(study, options)
+    store.probe(out)
     result = _sweep(scene, axes, options)
     result.attrs["history"] = _command_line(study, arguments)
-    return _report(study, options, result, sieve)
+    return _report(study, options, result, sieve, out)
+
+
+def _check_tolerance(options: Options) -> None:
+    if options.tolerance is None:
+        return
+    if not 1e-4 <= options.tolerance <= 0.5:
+        raise ValueError(f"--tolerance: got {options.tolerance:g}; must be within 0.0001 to 0.5; such as 0.01")
+    given = [name for name in ("level", "cells", "points") if getattr(options, name) is not None]
+    if given:
+        raise ValueError(
+            f"--{given[0]}: got it beside --tolerance, which chooses points and cells itself; give one of them"
+        )
 
 
 def base_scene(name: str, **resolution: int | str) -> Scene:
@@ -146,8 +165,8 @@ def _axes(study: Study, options: Options, scene: Scene) -> dict[str, list]:
     if scene.feed.kind == "single" and (study.main == "feed_top_size" or options.feed_top_size):
         raise ValueError("--feed-top-size: the scene's feed is of a single size and has no top; sweep another feed")
     order = [study.main, *(name for name in AXES if name != study.main)]
-    axes = {AXES[name]: list(getattr(options, name)) for name in order if getattr(options, name)}
-    if not getattr(options, study.main):
+    axes = {AXES[name]: list(getattr(options, name)) for name in order if getattr(options, name) is not None}
+    if getattr(options, study.main) is None:
         axes = {AXES[study.main]: _default_values(study, scene), **axes}
     from studies.sweep import axis_values  # late, like all that --help does without
 
@@ -181,9 +200,13 @@ def _sieve(options: Options, scene: Scene) -> float:
 def _sweep(scene: Scene, axes: dict[str, list], options: Options) -> "xr.Dataset":
     from studies.sweep import sweep
 
-    if options.tolerance is not None and not 1e-4 <= options.tolerance <= 0.5:
-        raise ValueError(f"--tolerance: got {options.tolerance:g}; must be within 0.0001 to 0.5; such as 0.01")
-    common = {"tolerance": options.tolerance, "replicates": options.replicates, "seed": options.seed, "progress": True}
+    common = {
+        "tolerance": options.tolerance,
+        "max_cost": options.max_cost,
+        "replicates": options.replicates,
+        "seed": options.seed,
+        "progress": True,
+    }
     if options.scheduler is None:
         return sweep(scene, axes, threads=options.workers, **common)
     from distributed import Client
@@ -208,12 +231,14 @@ def _print_cases(scene: Scene, axes: dict[str, list], options: Options) -> None:
             continue
         total += cost.seconds * options.replicates
         print(f"{shown}{cost.bytes / 1e6:>9.1f} MB{cost.seconds * 1e3:>9.1f} ms")
+    if options.tolerance is not None:
+        print(f"\nbefore refinement: --tolerance {options.tolerance:g} chooses points and cells when a case is run")
     count = options.replicates * sum(1 for _ in enumerate_cases(axes, 1))
     print(f"\n{count} cases ({options.replicates} replicates each), about {total / options.workers:.2g} s on "
           f"{options.workers} threads, plus start-up")  # fmt: skip
 
 
-def _report(study: Study, options: Options, result: "xr.Dataset", sieve: float) -> int:
+def _report(study: Study, options: Options, result: "xr.Dataset", sieve: float, out: Path) -> int:
     """Write the files, print the table, and return the exit code."""
     from studies import report, store
 
@@ -224,9 +249,6 @@ def _report(study: Study, options: Options, result: "xr.Dataset", sieve: float) 
         print("no case holds a result; nothing was written", file=sys.stderr)
         return 1
     sayings = [*report.change(result, AXES[study.main]), _caption(study, result)]
-    out = options.out or Path("outputs") / f"{study.name}.nc"
-    if out.suffix != ".nc":
-        out = out.with_name(out.name + ".nc")
     try:
         store.write_dataset(result, out)
         written = [out]
@@ -243,6 +265,11 @@ def _report(study: Study, options: Options, result: "xr.Dataset", sieve: float) 
         print(line)
     print("wrote " + " and ".join(map(str, written)))
     return 1 if lost else 0
+
+
+def _out(study: Study, options: Options) -> Path:
+    out = options.out or Path("outputs") / f"{study.name}.nc"
+    return out if out.suffix == ".nc" else out.with_name(out.name + ".nc")
 
 
 def _caption(study: Study, result: "xr.Dataset") -> str:

@@ -54,6 +54,7 @@ def sweep_figure(result: xr.Dataset, field: str, sieve: float, caption: str) -> 
         words.append(f"Panels show at most {_MOST_LINES} of the operating points, evenly chosen.")
     if result.sizes["replicate"] > 1:
         words.append(f"Mean of {result.sizes['replicate']} replicates; bars: ± one standard deviation.")
+    words += [line[0].upper() + line[1:] + "." for line in report.flags(result)]
     note = Scene.model_validate_json(result.attrs["scene"]).note
     figure.supxlabel("\n".join([*words, *([f"Scene: {note}."] if note else [])]), fontsize=9)
     return figure
@@ -103,6 +104,7 @@ def fineness_across_gap(left, right, result: xr.Dataset, sieve: float) -> bool:
     for panel in (left, right):
         panel.set_xlabel("position across the gap, roll to roll [half gaps]")
         panel.set_xlim(-1, 1)
+        panel.set_xticks([-1, -0.5, 0, 0.5, 1])
         for roll in (-1, 1):
             panel.axvline(roll, color="0.3", linewidth=2)
         panel.grid(color="0.9")
@@ -187,7 +189,7 @@ def _mirrored(xi: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def _style(k: int, count: int) -> dict:
     return {
-        "color": maps.batlow(0.85 * k / max(count - 1, 1)),
+        "color": maps.batlow(0.7 * k / max(count - 1, 1)),
         "marker": _MARKERS[k % len(_MARKERS)],
         "linestyle": _DASHES[k % len(_DASHES)],
         "markersize": 4.5,

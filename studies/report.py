@@ -84,13 +84,32 @@ def notes(result: xr.Dataset) -> list[str]:
         worst = {name: 100 * float(result[error].max()) for name, error in ERRORS.items() if error in result}
         told = ", ".join(f"{name.replace('_', ' ')} {error:.2g} %" for name, error in worst.items())
         lines.append(f"estimated errors of a run (bias + 2 standard errors), at most: {told}")
+    if result.attrs.get("left_out"):
+        lines.append(f"left out, being of another shape from case to case: {result.attrs['left_out']}")
+    if "exchange_passes" in result:
+        swaps = float(result["swaps_per_cell"].mean())
+        lines.append(
+            f"exchange: {swaps:.3g} swaps of a cell in one residence time; "
+            f"at most {int(result['exchange_passes'].max())} passes a time step"
+        )
+    return lines + flags(result)
+
+
+def flags(result: xr.Dataset) -> list[str]:
+    """Return a line for each limit that operating points have hit, with the words of the first that did."""
     if "flags" not in result:
-        return lines
+        return []
     points = operating_points(result)
+    lines = []
     for name, mask in FLAGS.items():
-        hit = ((points["flags"] & mask) > 0).any("replicate")
+        hit = (points["flags"] & mask) > 0
         if hit.any():
-            lines.append(f"flag {name}: at {int(hit.sum())} of {hit.size} operating points")
+            texts = points["notes"].transpose(*hit.dims).values[hit.values]
+            told = next(line for line in str(texts[0]).splitlines() if line.startswith(name)).partition(": ")[2]
+            count = int(hit.any("replicate").sum())
+            lines.append(
+                f"flag {name} at {count} of {points.sizes['operating_point']} operating points; the first: {told}"
+            )
     return lines
 
 

@@ -28,6 +28,18 @@ def write_dataset(dataset: xr.Dataset, path: str | Path) -> None:
     replace(path, write)
 
 
+def probe(path: str | Path) -> None:
+    """Raise OSError if a file at `path` could not be written: better before hours of work than after."""
+    path = Path(path)
+    existing = next(folder for folder in path.absolute().parents if folder.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK):
+        raise OSError(
+            f"could not write the result: {existing} is no folder that can be written to; choose another --out"
+        )
+    if path.is_dir():
+        raise OSError(f"could not write the result: {path} is a folder; give --out the name of a file")
+
+
 def replace(path: str | Path, write: Callable[[Path], object]) -> None:
     """Let `write` make a file under a temporary name, then put it in the place of `path`.
 

@@ -16,7 +16,7 @@ import hpgr
 from hpgr import budget, pipeline, schema
 from hpgr import tolerance as tolerances
 from hpgr.keys import refuse_key
-from hpgr.scene import Scene, faults_of, field_info, field_value
+from hpgr.scene import Scene, faults_of, field_info, field_value, level_text
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -40,12 +40,13 @@ class Case(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What became of a case: its summary by variable name, or why there is none."""
+    """What became of a case: its summary by variable name and the limits it hit, or why there is none."""
 
     index: tuple[int, ...]
     status: str
     message: str
     summary: dict[str, tuple[tuple[str, ...], np.ndarray]]
+    notes: str = ""
 
 
 def sweep(
@@ -57,6 +58,7 @@ def sweep(
     threads: int = 2,
     progress: bool = False,
     tolerance: float | None = None,
+    max_cost: float = 60.0,
 ) -> "xr.Dataset":
     """Run `scene` at every combination of `axes`, and return the summaries as one Dataset.
 
@@ -80,6 +82,8 @@ def sweep(
     tolerance : float, optional
         Wanted relative error, as in `hpgr.simulate`: every operating point gets a resolution of its own, and
         its estimated errors. Where streamlines differ, variables along them are left out.
+    max_cost : float
+        Predicted seconds that meeting the tolerance may take at an operating point.
 
     Returns
     -------
@@ -109,7 +113,7 @@ def sweep(
             raise ValueError(f"{name}: got {value}; must be at least 1; such as {name}=2")
     base = scene.with_values({"resolution.record": "product"})
     cases = list(enumerate_cases(grid, replicates))
-    outcomes = _outcomes((base, seed, tolerance), cases, client, threads, progress)
+    outcomes = _outcomes((base, seed, tolerance, max_cost), cases, client, threads, progress)
     result = _assemble(base, grid, replicates, seed, outcomes)
     return result if tolerance is None else result.assign_attrs(tolerance=tolerance)
 
@@ -162,32 +166,32 @@ def dim_of(name: str) -> str:
 class Bench:
     """Runs the cases of a batch one after the other, and keeps what the next may share: scene and loaded bed."""
 
-    def __init__(self, base: Scene, seed: int, tolerance: float | None = None):
-        self._base, self._seed, self._tolerance = base, seed, tolerance
+    def __init__(self, base: Scene, seed: int, tolerance: float | None, max_cost: float):
+        self._base, self._seed, self._tolerance, self._max_cost = base, seed, tolerance, max_cost
         self._values: dict[str, Any] | None = None
         self._scene, self._key, self._prepared = base, None, None
-        self._errors: dict[str, float] = {}
+        self._chosen: dict[str, float] = {}
 
     def simulate(self, case: Case) -> dict[str, Any]:
         """Return the variables of a case by name, as `hpgr.simulate` would."""
         if case.values != self._values:
             self._scene, self._values = self._base.with_values(case.values), None
             if self._tolerance is not None:
-                estimate = tolerances.refine(self._scene, self._tolerance, seed=self._seed)
-                self._scene = estimate.scene
-                self._errors = {schema.ERRORS[name]: error for name, error in estimate.errors().items()}
+                estimate = tolerances.refine(self._scene, self._tolerance, self._max_cost, self._seed)
+                self._scene, self._chosen = estimate.scene, estimate.variables()
             budget.refuse_too_large(self._scene)
             self._values = case.values  # now only: a refused scene must not be taken for the next replicate's
         key = pipeline.bed_key(self._scene)
         if key != self._key:
             self._prepared, self._key = pipeline.prepare(self._scene), key
-        return pipeline.crush(self._scene, self._prepared, self._seed, case.replicate) | self._errors
+        return pipeline.crush(self._scene, self._prepared, self._seed, case.replicate) | self._chosen
 
 
 def run_case(bench: Bench, case: Case) -> Outcome:
     """Simulate one case; whatever happens is told in the outcome, never raised."""
     try:
-        summary = summarise(bench.simulate(case))
+        values = bench.simulate(case)
+        summary = summarise(values)
     except ValidationError as error:
         return Outcome(case.index, "refused", faults_of(error), {})
     except (ValueError, MemoryError) as error:
@@ -197,7 +201,7 @@ def run_case(bench: Bench, case: Case) -> Outcome:
     broken = [name for name, (_, value) in summary.items() if not np.isfinite(value).all()]
     if broken:
         return Outcome(case.index, "failed", f"not finite: {', '.join(broken)}", {})
-    return Outcome(case.index, "ok", "", summary)
+    return Outcome(case.index, "ok", "", summary, values["notes"])
 
 
 def summarise(values: Mapping[str, Any]) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
@@ -236,6 +240,8 @@ def _outcomes(bench_of, cases, client, threads, progress) -> Iterator[Outcome]:
     workers = max(1, sum(client.nthreads().values()))
     quick = int(_BATCH_SECONDS / budget.predict(bench_of[0]).seconds)
     size = max(1, min(_BATCH, quick, len(cases) // (4 * workers)))
+    if bench_of[2] is not None:  # a tolerance: the replicates of an operating point share its refinement
+        size = 1 + max(case.replicate for case in cases)
     batches = [cases[start : start + size] for start in range(0, len(cases), size)]
     futures = client.map(_run_batch, [bench_of] * len(batches), batches, pure=False)
     sent = dict(zip(futures, batches, strict=True))
@@ -270,12 +276,12 @@ def _assemble(base, grid, replicates, seed, outcomes) -> "xr.Dataset":
     dims = (*(dim_of(name) for name in grid), "replicate")
     shape = (*(len(values) for values in grid.values()), replicates)
     status = np.full(shape, STATUS["failed"], np.int8)
-    messages = np.full(shape, "", object)
+    messages, notes = np.full(shape, "", object), np.full(shape, "", object)
     stacks: dict[str, tuple[tuple[str, ...], np.ndarray]] = {}
     uneven: set[str] = set()
     for outcome in outcomes:
         status[outcome.index] = STATUS[outcome.status]
-        messages[outcome.index] = outcome.message
+        messages[outcome.index], notes[outcome.index] = outcome.message, outcome.notes
         for name, (own_dims, value) in outcome.summary.items():
             stack = stacks.get(name)
             if stack is None:
@@ -305,6 +311,7 @@ def _assemble(base, grid, replicates, seed, outcomes) -> "xr.Dataset":
         "flag_values": np.array(list(STATUS.values()), np.int8), "flag_meanings": " ".join(STATUS),
     })  # fmt: skip
     dataset["message"] = (dims, messages, {"long_name": "why a case holds no result"})
+    dataset["notes"] = (dims, notes, {"long_name": "which limits a case hit, in words"})
     return dataset
 
 
@@ -323,5 +330,6 @@ def _attributes(base, grid, replicates, seed, uneven) -> dict[str, Any]:
         "seed": seed,
         "replicates": replicates,
         "left_out": ", ".join(sorted(uneven)),
+        "level": level_text(base.resolution.level),
         "versions": ", ".join(f"{name} {version(name)}" for name in _LIBRARIES),
     }

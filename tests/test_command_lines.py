@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 
 import hpgr
+from hpgr import pipeline
 from studies import feed_sweep, gap_sweep, speed_sweep
 
 SMALL = ["--cells", "60", "--points", "40", "--streamlines", "3"]
@@ -281,14 +282,14 @@ def test_lost_cases_are_named_and_exit_code_is_1(run, folder):
 
 
 def test_failing_case_is_named(run, monkeypatch):
-    real = hpgr.simulate
+    real = pipeline.crush
 
-    def simulate(scene, seed, replicate):
+    def crush(scene, prepared, seed, replicate):
         if replicate == 1:
             raise RuntimeError("boom")
-        return real(scene, seed, replicate)
+        return real(scene, prepared, seed, replicate)
 
-    monkeypatch.setattr(hpgr, "simulate", simulate)
+    monkeypatch.setattr(pipeline, "crush", crush)
     code, out, err = run("--gap", "40 mm", "--no-plot")
     assert code == 1
     assert "failed: gap 40 mm, 1 of 3 replicates: RuntimeError: boom" in err

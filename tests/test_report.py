@@ -158,12 +158,13 @@ def test_lost_cases_of_a_text_axis():
 
 def test_notes(result):
     result["flags"][:] = 0
+    result["notes"][:] = "no_breakage: whole\nfew_cells: too few"
     assert report.notes(result) == []
     result["flags"][{"roll_speed": 0, "gap": 1, "replicate": 2}] = FLAGS["no_breakage"] | FLAGS["few_cells"]
     result["flags"][{"roll_speed": 2}] = FLAGS["few_cells"]
     assert report.notes(result) == [
-        "flag no_breakage: at 1 of 6 operating points",
-        "flag few_cells: at 3 of 6 operating points",
+        "flag no_breakage at 1 of 6 operating points; the first: whole",
+        "flag few_cells at 3 of 6 operating points; the first: too few",
     ]
     result.attrs["scene"] = result.attrs["scene"].replace('"note":""', '"note":"not calibrated"')
     assert report.notes(result)[0] == "note: not calibrated"
