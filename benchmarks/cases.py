@@ -15,7 +15,7 @@ import time
 import numpy as np
 
 import hpgr
-from hpgr import kernels, parcels, pipeline, solve
+from hpgr import kernels, parcels, pipeline, solve, tessellation
 from studies.sweep import sweep
 
 
@@ -38,12 +38,25 @@ def kernel_ms(scene, prepared):
     none = (np.empty(0), np.empty((0, 0), np.float32), np.empty((0, 0), np.int64))
     times = []
     for replicate in range(31):
-        cells = [parcels.first_cells(scene, 0, (replicate, line, 0)) for line in range(len(log_stress))]
+        keys = [(replicate, line, 0) for line in range(len(log_stress))]
+        sizes, streams = parcels.first_cells(scene, 0, keys)
         start = time.perf_counter()
-        for line, (sizes, streams) in enumerate(cells):
-            kernels.march(sizes, streams, log_stress[line], needed[line], *none, *parcels.constants(scene))
+        for line in range(len(keys)):
+            kernels.march(sizes[line], streams[line], log_stress[line], needed[line], *none, *parcels.constants(scene))
         times.append(time.perf_counter() - start)
     return 1e3 * statistics.median(times[1:])
+
+
+def sweep_ratio(what, scene, gaps):
+    """Print the time of a sweep on one thread and on two, in turns."""
+    axes = {"rolls.gap": np.linspace(0.03, 0.1, gaps), "feed.top_size": np.linspace(0.03, 0.06, 20)}
+    timed = {}
+    for threads in (1, 2, 1, 2, 1, 2):
+        start = time.perf_counter()
+        sweep(scene, axes, threads=threads)
+        timed.setdefault(threads, []).append(time.perf_counter() - start)
+    one, two = (statistics.median(timed[threads]) for threads in (1, 2))
+    print(f"sweep, {what}: {one:.2f} s on 1 thread, {two:.2f} s on 2 (ratio {one / two:.2f})")
 
 
 def main():
@@ -56,14 +69,14 @@ def main():
     print(f"  of which bed and stress:           {median_ms(lambda: pipeline.prepare(scene)):.2f} ms")
     print(f"a case that shares its bed:          {median_ms(lambda: pipeline.crush(scene, prepared, 0, 0)):.2f} ms")
 
-    axes = {"rolls.gap": np.linspace(0.03, 0.1, 50), "feed.top_size": np.linspace(0.03, 0.06, 20)}
-    timed = {}
-    for threads in (1, 2, 1, 2, 1, 2):
-        start = time.perf_counter()
-        sweep(scene, axes, threads=threads)
-        timed.setdefault(threads, []).append(time.perf_counter() - start)
-    one, two = (statistics.median(timed[threads]) for threads in (1, 2))
-    print(f"sweep of 1,000 cases: {one:.2f} s on 1 thread, {two:.2f} s on 2 (ratio {one / two:.2f})")
+    motion = prepared.motion
+    print(
+        f"tessellation, 10 x 200: {median_ms(lambda: tessellation.tessellate(scene, prepared.bed, motion), 5):.0f} ms"
+    )
+
+    sweep_ratio("1,000 cases of 10 x 200 x 1,000, 50 gaps x 20 feeds", scene, 50)
+    sweep_ratio("4,000 cases of 10 x 200 x 1,000, 200 gaps x 20 feeds", scene, 200)
+    sweep_ratio("200 cases of 10 x 200 x 10,000", scene.with_values({"resolution.cells": 10_000}), 10)
 
     mixed = scene.with_values({"exchange": {}})
     seconds = median_ms(lambda: hpgr.simulate(mixed), 3) / 1e3

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from numba import njit
 
-from hpgr import feed, flow, geometry, kernels, presets, stress
+from hpgr import flow, geometry, kernels, parcels, presets, stress
 
 POINTS = (100, 200, 400, 800, 1600, 3200)
 EXPONENTS = (0.5, 1.0, math.inf)
@@ -35,10 +35,8 @@ def case(points, cells):
     crushing = stress.crushing_stress(scene, motion, stress.load(scene, motion))
     with np.errstate(divide="ignore"):
         log_stress = np.log(crushing[0] / scene.material.strength)
-    seeds = np.random.SeedSequence(0, spawn_key=(0, 0, 0))
-    streams = np.empty(cells, np.uint64)
-    kernels.start_streams(seeds.generate_state(1, np.uint64)[0], streams)
-    return feed.draw(scene.feed, cells, seeds), streams, log_stress
+    (sizes,), (streams,) = parcels.first_cells(scene.with_values({"resolution.cells": cells}), 0, [(0, 0, 0)])
+    return sizes, streams, log_stress
 
 
 @functools.cache

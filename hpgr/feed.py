@@ -1,4 +1,4 @@
-"""Feed size distributions: passing, its inverse, and the cells of a parcel drawn from it."""
+"""Feed size distributions: passing, and its inverse."""
 
 import numpy as np
 
@@ -44,17 +44,6 @@ def _quantile(feed: Feed, fraction: np.ndarray) -> np.ndarray:
     if feed.top_size is not None:
         fraction = fraction * _scalped(feed)
     return np.exp(np.interp(fraction, *_rising(table, log_size)))
-
-
-def draw(feed: Feed, cells: int, source: np.random.SeedSequence) -> np.ndarray:
-    """Return `cells` sizes in m, float32: the feed's quantiles at stratified uniforms, in random cell order.
-
-    One uniform in each of `cells` equal strata represents the feed with a lower variance than plain
-    sampling (model page, section 4).
-    """
-    generator = np.random.Generator(np.random.PCG64(source))
-    uniforms = (generator.permutation(cells) + generator.random(cells)) / cells
-    return quantile(feed, uniforms).astype(np.float32)
 
 
 def _rosin_rammler(feed: Feed, size):

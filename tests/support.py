@@ -94,12 +94,38 @@ def crush(scene, stress, seed=0, replicate=0):
     return solve.crush(**{name: known.get(name) for name in inspect.signature(solve.crush).parameters})
 
 
+def draw(given_feed, cells, source):
+    """Sizes of a parcel as the package draws them, from a SeedSequence."""
+    uniforms = np.empty(cells)
+    kernels.stratify(source.generate_state(2, np.uint64)[1], uniforms)
+    return feed.quantile(given_feed, uniforms).astype(np.float32)
+
+
 def first_cells(scene, seed, key):
     """The cells of a parcel of feed, as the model page has it: every bit keyed by seed and key.
 
-    Written out here, so that the product of a scene in which nothing breaks is compared with something else.
+    Written out here in plain Python, so that the product of a scene in which nothing breaks is compared with
+    something else.
     """
-    source = np.random.SeedSequence(seed, spawn_key=key)
-    found = np.empty(scene.resolution.cells, np.uint64)
-    kernels.start_streams(source.generate_state(1, np.uint64)[0], found)
-    return np.maximum(feed.draw(scene.feed, found.size, source), np.float32(kernels.SMALLEST)), found
+    cells = scene.resolution.cells
+    base, state = (int(one) for one in np.random.SeedSequence(seed, spawn_key=key).generate_state(2, np.uint64))
+    streams = [split_mix(base + (p + 1) * GOLDEN) for p in range(cells)]
+    numbers = ((split_mix(state + k * GOLDEN) >> 12) + 0.5 for k in range(1, 2 * cells))
+    order = list(range(cells))
+    for p in range(cells - 1, 0, -1):
+        q = int(next(numbers) * 2.0**-52 * (p + 1))
+        order[p], order[q] = order[q], order[p]
+    uniforms = np.array([(stratum + next(numbers) * 2.0**-52) / cells for stratum in order])
+    sizes = feed.quantile(scene.feed, uniforms).astype(np.float32)
+    return np.maximum(sizes, np.float32(kernels.SMALLEST)), np.array(streams, np.uint64)
+
+
+GOLDEN = 0x9E3779B97F4A7C15
+
+
+def split_mix(state):
+    """SplitMix64's output for a state, in Python's integers (Steele, Lea & Flood 2014)."""
+    z = state % 2**64
+    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9 % 2**64
+    z = (z ^ (z >> 27)) * 0x94D049BB133111EB % 2**64
+    return z ^ (z >> 31)

@@ -83,7 +83,7 @@ def test_pareto_by_hand():
 def test_plain_rule_is_the_kernels_bit_for_bit():
     scene = paper({"resolution.cells": 40, "material.fragment_exponent": 1.0})
     log_stress = np.log(pipeline.prepare(scene).crushing[1].clip(1e-300) / scene.material.strength)
-    sizes, streams = parcels.first_cells(scene, 0, (0, 1, 0))
+    (sizes,), (streams,) = parcels.first_cells(scene, 0, [(0, 1, 0)])
     plain, plain_streams = sizes.copy(), streams.copy()
     accuracy.plain_march(scene, plain, plain_streams, log_stress)
     none, no_classes = np.empty((0, 0), np.float32), np.empty((0, 0), np.int64)

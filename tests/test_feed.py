@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support import sized
+from support import draw, sized
 
 from hpgr import Feed, feed
 
@@ -76,7 +76,7 @@ def test_table_is_extended_to_zero_along_its_first_slope():
 
 
 def test_sieves_without_mass_hold_no_grains():
-    drawn = feed.draw(FEEDS["table"], 2000, np.random.SeedSequence(1))
+    drawn = draw(FEEDS["table"], 2000, np.random.SeedSequence(1))
     assert not np.any((drawn > 0.00201) & (drawn < 0.00399))
 
 
@@ -100,7 +100,7 @@ def test_shapes_are_kept(given_feed, shape):
 @pytest.mark.parametrize("cells", [1, 2, 17, sized(10_000, 500)])
 def test_draw_is_stratified(given_feed, cells):
     """One uniform per stratum keeps the KS distance below 1 / M for certain; plain sampling has 0.9 / sqrt(M)."""
-    drawn = feed.draw(given_feed, cells, np.random.SeedSequence(7))
+    drawn = draw(given_feed, cells, np.random.SeedSequence(7))
     assert drawn.dtype == np.float32
     ordered = np.sort(drawn.astype(float))
     exact = feed.passing(given_feed, ordered)
@@ -111,9 +111,9 @@ def test_draw_is_stratified(given_feed, cells):
 
 
 def test_draw_order_is_random_and_follows_the_source():
-    first = feed.draw(FEEDS["uniform"], 1000, np.random.SeedSequence(1))
-    assert np.array_equal(first, feed.draw(FEEDS["uniform"], 1000, np.random.SeedSequence(1)))
-    second = feed.draw(FEEDS["uniform"], 1000, np.random.SeedSequence(2))
+    first = draw(FEEDS["uniform"], 1000, np.random.SeedSequence(1))
+    assert np.array_equal(first, draw(FEEDS["uniform"], 1000, np.random.SeedSequence(1)))
+    second = draw(FEEDS["uniform"], 1000, np.random.SeedSequence(2))
     assert not np.array_equal(np.argsort(first), np.argsort(second))
     # neighbours are uncorrelated: |r| sqrt(M) is beyond 5 once in 1.7 million
     assert abs(np.corrcoef(first[1:], first[:-1])[0, 1]) * math.sqrt(1000) < 5
@@ -121,7 +121,7 @@ def test_draw_order_is_random_and_follows_the_source():
 
 @each
 def test_drawn_sizes_lie_within_the_feed(given_feed):
-    drawn = feed.draw(given_feed, 1000, np.random.SeedSequence(3))
+    drawn = draw(given_feed, 1000, np.random.SeedSequence(3))
     assert np.all(drawn > 0)
     assert np.all(drawn <= np.float32(given_feed.coarsest))
 

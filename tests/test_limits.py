@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from support import KS, SIGMAS, critical_log_stress, ks_distance, march, sized, streams
+from support import KS, SIGMAS, critical_log_stress, draw, ks_distance, march, sized, streams
 
 from hpgr import Feed, Material, feed, limits
 
@@ -42,7 +42,7 @@ def test_critical_size_has_its_limits():
 def test_closed_form_is_the_march_run_to_completion(given_feed, gamma, critical):
     """A1 and A3. The feed is stratified, so KS for plain sampling bounds it: by chance once in a million."""
     cells = sized(50_000, 1_000)
-    drawn = feed.draw(given_feed, cells, np.random.SeedSequence(61))
+    drawn = draw(given_feed, cells, np.random.SeedSequence(61))
     found, _, breaks = march(drawn, streams(cells, 61), [critical_log_stress(critical)] * 80, n=INF, gamma=gamma)
     distance = ks_distance(found, lambda x: limits.crushed_passing(given_feed, x, critical, gamma))
     assert distance < KS / math.sqrt(cells)

@@ -378,7 +378,12 @@ def test_stress_only_does_no_cell_work(monkeypatch):
     def refuse(*args, **kwargs):
         raise AssertionError("cell work")
 
-    for room, name in ((kernels, "march"), (kernels, "start_streams"), (feed, "draw"), (limits, "critical_size")):
+    for room, name in (
+        (kernels, "march_parcels"),
+        (kernels, "start_parcels"),
+        (feed, "quantile"),
+        (limits, "critical_size"),
+    ):
         monkeypatch.setattr(room, name, refuse)
     ds = simulate(paper({"resolution.cells": 0}))
     cells_only = {name for name, entry in schema.VARIABLES.items() if {"cell", "sieve"} & set(entry.dims)}

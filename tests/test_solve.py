@@ -42,8 +42,8 @@ def test_closed_form_draws_no_cells(monkeypatch):
     def refuse(*args, **kwargs):
         raise AssertionError("cell work")
 
-    monkeypatch.setattr(kernels, "march", refuse)
-    monkeypatch.setattr(feed, "draw", refuse)
+    monkeypatch.setattr(kernels, "march_parcels", refuse)
+    monkeypatch.setattr(feed, "quantile", refuse)
     scene = paper({"material.cushioning": INF, "resolution.record": "product"})
     assert simulate(scene)["p80_total"] > 0
     with pytest.raises(AssertionError, match="cell work"):
@@ -142,12 +142,12 @@ def test_a_feed_from_zero_holds_no_grain_of_size_zero():
 
 
 def test_summaries_are_those_of_the_recorded_cells():
-    scene = paper({"resolution.photographs": 2, "material.size_floor": "3 mm"})
+    scene = paper({"resolution.photographs": 2, "material.size_floor": "1 mm"})
     found = crush(scene, load(scene), 0, 0)
     product = found.size[:, :, -1].transpose(1, 0, 2).reshape(3, -1).astype(float)
     assert found.percentiles == pytest.approx(np.quantile(product, [0.5, 0.8], axis=1), rel=1e-6)
     assert found.total_percentiles == pytest.approx(np.quantile(product, [0.5, 0.8]), rel=1e-6)
-    below = np.mean(product < 0.003, axis=1)
+    below = np.mean(product < 0.001, axis=1)
     assert np.array_equal(found.below_floor, below)
     assert 0 < below[0] < 1
     sieves = np.array(scene.resolution.sieves)
