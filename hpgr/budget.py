@@ -1,5 +1,6 @@
 """What a scene will cost, before it is run: memory against this machine's limit, and time."""
 
+import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,7 +35,8 @@ def predict(scene: Scene) -> Cost:
     seconds = 2.5e-3 + 1.5e-6 * fields
     if cells:
         product = 4 * grid.photographs * lines * cells
-        size += 3 * product + 40 * cells  # kept, pooled, sorted; and the work space of one line
+        at_once = max(os.cpu_count() or 1, 200_000 // cells)  # parcels, see hpgr.solve
+        size += 3 * product + 40 * cells * min(lines * grid.photographs, at_once)  # kept, pooled, sorted; work space
         seconds += grid.photographs * lines * cells * (0.28e-6 + 0.15e-9 * points)
         frames = grid.photographs
         if scene.exchange is not None:

@@ -16,7 +16,7 @@ from hpgr.scene import Scene
 _NO_SIEVES = np.empty(0)
 _NO_SNAPSHOTS = np.empty((0, 0, 0), np.float32)
 _NO_CLASSES = np.empty((0, 0, 0), np.int64)
-_LARGE = 200_000  # cells of all parcels from which a case takes all cores; smaller ones fill them side by side
+_LARGE = 200_000  # cells of all parcels from which they are marched one by one, on all cores; fewer go at once
 
 
 class Exchanged(NamedTuple):
@@ -166,13 +166,15 @@ def _march(scene: Scene, log_stress: np.ndarray, seed: int, replicate: int) -> C
             counts[part], *parcels.constants(scene),
         )  # fmt: skip
 
+    large = product.size >= _LARGE
+    parts = [slice(k, k + 1) for k in range(len(columns))] if large else [slice(None)]
     # only for a caller of hpgr.simulate: the worker threads of a study have the cores already
-    alone = threading.current_thread() is threading.main_thread()
-    if alone and product.size >= _LARGE:
+    if large and threading.current_thread() is threading.main_thread():
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            list(pool.map(march, [slice(k, k + 1) for k in range(len(columns))]))
+            list(pool.map(march, parts))
     else:
-        march(slice(None))
+        for part in parts:
+            march(part)
     breaks = counts.reshape(shape[:2]).sum(axis=0).astype(float)
     return _summarised(scene, product, breaks, size, classes)
 

@@ -119,7 +119,7 @@ def _enough_streamlines(scene: Scene, wanted: float, spent: _Purse) -> tuple[Sce
         here, finer = (_smooth_figures(scene, count, 201, spent) for count in (lines, 2 * lines))
         # midpoint rule, second order: 4/3 of the difference is the bias
         bias = dict.fromkeys(QUANTITIES if scene.resolution.cells else QUANTITIES[-1:], 0.0)
-        bias |= {name: _SAFETY * 4 / 3 * abs(_relative(here, finer, name)) for name in here}
+        bias |= {name: _SAFETY * 4 / 3 * abs(relative(here, finer, name)) for name in here}
         if max(bias.values()) <= wanted:
             return scene, bias
         scene = scene.with_values({"resolution.streamlines": 2 * lines})
@@ -161,7 +161,7 @@ def _sampling_bias(scene: Scene, spent: _Purse) -> dict[str, float]:
     lines, points = scene.resolution.streamlines, scene.resolution.points
     finest = max(2 * points - 1, min(8 * points - 7, 12_801))
     here, finer = (_smooth_figures(scene, lines, count, spent) for count in (points, finest))
-    return {name: _SAFETY * abs(_relative(here, finer, name)) for name in here}
+    return {name: _SAFETY * abs(relative(here, finer, name)) for name in here}
 
 
 def _smooth_figures(scene: Scene, streamlines: int, points: int, spent: _Purse) -> dict[str, float]:
@@ -179,7 +179,7 @@ def _smooth_figures(scene: Scene, streamlines: int, points: int, spent: _Purse) 
 
 def _step(coarse: list[dict], fine: list[dict], name: str) -> tuple[float, float]:
     """Return the relative change from one grid to the next, and its standard error, over paired replicates."""
-    changes = np.array([_relative(a, b, name) for a, b in zip(coarse, fine, strict=True)])
+    changes = np.array([relative(a, b, name) for a, b in zip(coarse, fine, strict=True)])
     error = changes.std(ddof=1) / math.sqrt(changes.size) if changes.size > 1 else 0.0
     return float(changes.mean()), float(error)
 
@@ -202,9 +202,10 @@ def _scatter(runs: list[dict]) -> dict[str, float]:
     return found
 
 
-def _relative(a: dict, b: dict, name: str) -> float:
+def relative(a: dict[str, float], b: dict[str, float], name: str) -> float:
+    """Return how far figure `name` of `a` is from that of `b`, relative to the latter."""
     scale = max(abs(b[name]), _LEAST_FINENESS if name == "fineness" else 1e-300)
-    return (b[name] - a[name]) / scale
+    return (a[name] - b[name]) / scale
 
 
 def _figures(scene: Scene, seed: int, replicate: int, prepared: pipeline.Prepared) -> dict[str, float]:

@@ -1,4 +1,5 @@
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -203,3 +204,15 @@ def test_strong_cushioning_needs_small_time_steps():
         assert p80 == pytest.approx(figure, rel=SIGMAS * 2 * ordered_error(cells)[1] + 0.0025)
         found.append(p80)
     assert np.all(np.diff(found) > 0)
+
+
+def test_large_case_marched_on_all_cores_or_one_by_one_has_the_same_bits(monkeypatch):
+    scene = paper({"resolution.photographs": 2, "resolution.record": "distributions"})
+    at_once = crush(scene, load(scene), 5, 1)
+    monkeypatch.setattr(solve, "_LARGE", 1)
+    on_all_cores = crush(scene, load(scene), 5, 1)
+    with ThreadPoolExecutor(1) as pool:  # a worker thread of a study
+        one_by_one = pool.submit(crush, scene, load(scene), 5, 1).result()
+    for found in (on_all_cores, one_by_one):
+        for mine, other in zip(found, at_once, strict=True):
+            assert (mine is None and other is None) or np.array_equal(mine, other)
