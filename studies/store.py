@@ -56,7 +56,7 @@ def replace(path: str | Path, write: Callable[[Path], object]) -> None:
     try:
         write(part)
         _sync(part)
-        part.chmod(0o666 & ~_umask())  # mkstemp makes private files; a result is for colleagues too
+        part.chmod(0o666 & ~_umask())  # mkstemp makes private files; a result is for others too
         os.replace(part, path)
     except BaseException:
         part.unlink(missing_ok=True)

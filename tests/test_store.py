@@ -172,7 +172,7 @@ def test_file_is_synced_before_it_takes_its_name(tmp_path, monkeypatch):
     assert (tmp_path / "a.txt").read_text() == "whole"
 
 
-def test_file_is_readable_for_colleagues(path):
+def test_file_is_readable_for_others(path):
     mask = os.umask(0)
     os.umask(mask)
     assert path.stat().st_mode & 0o777 == 0o666 & ~mask
