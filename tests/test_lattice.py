@@ -209,7 +209,7 @@ class Watched:
             assert np.array_equal(before[0], after[0])  # sizes, bit for bit, and so the mass of each size class
             assert np.array_equal(before[1], after[1])  # each with its stream
             assert np.all(largest >= sizes.max(axis=1))
-            changed = np.any(reaches != reach, axis=1)
+            changed = np.any(reaches != reach, axis=1) & ~were_stale & ~stale  # stale bounds may hold anything
             self.mended += changed.sum()
             self.dense += np.sum(stale & ~were_stale)
             self.swaps += count
@@ -260,7 +260,7 @@ def test_every_step_is_the_plain_one_bit_for_bit(name, interrupted, monkeypatch)
         assert watched.machine.most_passes > 2
         assert watched.dense > 0
     if name in ("sparse", "rare", "mixing only"):
-        assert watched.mended > sized(20, 0)  # bounds mended cell by cell
+        assert watched.mended > sized(20, -1)  # bounds mended cell by cell
         assert watched.trusted > sized(20, -1)  # parcels crushed on bounds they carried through swaps
 
 
@@ -283,7 +283,7 @@ def test_both_ways_of_swapping_meet_in_one_scene(monkeypatch):
     for step in range(watched.scene.resolution.points + 1):
         watched.machine.advance(step)
     assert kinds == {True, False}
-    assert watched.mended > 0
+    assert watched.mended > sized(20, -1)
     assert watched.dense > 0
 
 
