@@ -55,7 +55,7 @@ def passing(dataset: xr.Dataset, sieves=None, point: int = -1, total: bool = Fal
     else:
         found = _recorded_passing(dataset, point)
         if sieves is not None:
-            found = _between_sieves(found, np.atleast_1d(np.asarray(sieves, dtype=float)))
+            found = between_sieves(found, np.atleast_1d(np.asarray(sieves, dtype=float)))
     found.attrs = {"units": "1", "long_name": "mass fraction passing"}
     found = found.rename("passing")
     return found.mean("streamline", keep_attrs=True) if total else found
@@ -189,7 +189,14 @@ def _recorded_passing(dataset: xr.Dataset, point: int) -> xr.DataArray:
     )
 
 
-def _between_sieves(found: xr.DataArray, wanted: np.ndarray) -> xr.DataArray:
+def between_sieves(found: xr.DataArray, wanted: np.ndarray) -> xr.DataArray:
+    """Return mass fractions (..., sieve) at other sizes (m), linear in log size between the recorded sieves.
+
+    Raises
+    ------
+    ValueError
+        If a size lies outside the recorded sieves.
+    """
     known = found["sieve"].values
     outside = wanted[(wanted < known[0]) | (wanted > known[-1])]
     if outside.size:
@@ -197,14 +204,12 @@ def _between_sieves(found: xr.DataArray, wanted: np.ndarray) -> xr.DataArray:
             f"sieves: got {outside[0]:g} m; must lie within the recorded {known[0]:g} to {known[-1]:g} m; "
             "extend resolution.sieves, or record 'cells'"
         )
-
-    def interpolate(fractions):
-        return np.interp(np.log(wanted), np.log(known), fractions)
-
-    result = xr.apply_ufunc(
-        interpolate, found, input_core_dims=[["sieve"]], output_core_dims=[["wanted"]], vectorize=True
-    )
-    return result.rename(wanted="sieve").assign_coords(sieve=wanted)
+    place = np.interp(np.log(wanted), np.log(known), np.arange(known.size))
+    before = place.astype(int)
+    after = np.minimum(before + 1, known.size - 1)
+    weight = xr.DataArray(place - before, dims="sieve")
+    finer, coarser = (found.drop_vars("sieve").isel(sieve=k) for k in (before, after))
+    return ((1 - weight) * finer + weight * coarser).transpose(*found.dims).assign_coords(sieve=wanted)
 
 
 def _percentile_between_sieves(found: xr.DataArray, fraction: float, total: bool) -> xr.DataArray:

@@ -34,14 +34,11 @@ class Estimate(NamedTuple):
         The scene at the chosen resolution.
     bias, noise : dict
         By quantity, relative: what is left of bias, and one standard error.
-    pilot_seconds : float
-        Predicted cost of the runs that led here, s.
     """
 
     scene: Scene
     bias: dict[str, float]
     noise: dict[str, float]
-    pilot_seconds: float
 
     def errors(self) -> dict[str, float]:
         """Return bias + 2 standard errors by quantity, relative."""
@@ -91,7 +88,7 @@ def refine(scene: Scene, tolerance: float, max_cost: float = 60.0, seed: int = 0
     shrink = math.sqrt(coarse.resolution.cells / cells) if cells else 0.0
     noise = {name: _NOISE_SAFETY * scatter.get(name, 0.0) * shrink for name in bias}
     spent.allow(budget.predict(chosen).seconds, chosen)
-    return Estimate(chosen, bias, noise, spent.seconds)
+    return Estimate(chosen, bias, noise)
 
 
 class _Purse:

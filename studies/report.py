@@ -3,7 +3,7 @@
 import numpy as np
 import xarray as xr
 
-from hpgr import units
+from hpgr import metrics, units
 from hpgr.scene import Scene
 from hpgr.schema import ERRORS, FLAGS
 from studies.sweep import STATUS
@@ -25,13 +25,7 @@ def operating_points(result: xr.Dataset) -> xr.Dataset:
 def percent_passing(result: xr.Dataset, sieve: float, total: bool = True) -> xr.DataArray:
     """Return the percent of the product passing `sieve` (m), linear in log size between recorded sieves."""
     fractions = result["passing_total" if total else "passing"]
-    logs = np.log(fractions["sieve"].values)
-    after = int(np.searchsorted(logs, np.log(sieve)).clip(1, max(logs.size - 1, 1)))
-    before = after - 1
-    after = min(after, logs.size - 1)
-    weight = (np.log(sieve) - logs[before]) / (logs[after] - logs[before]) if after > before else 0.0
-    finer, coarser = (fractions.isel(sieve=k, drop=True) for k in (before, after))
-    found = 100 * ((1 - weight) * finer + weight * coarser)
+    found = 100 * metrics.between_sieves(fractions, np.array([sieve])).isel(sieve=0, drop=True)
     found.attrs = {"units": "percent", "long_name": f"product below {units.show(sieve, 'm')}"}
     return found
 

@@ -8,6 +8,20 @@ import numpy as np
 
 from hpgr import feed, kernels, presets, solve
 
+SCENE_TOML = """
+[rolls]
+diameter = "0.8 m"
+width = "0.25 m"
+gap = "19 mm"
+entry_gap = "163 mm"
+speed = "16 rpm"
+
+[feed]
+kind = "uniform"
+bottom_size = "1 mm"
+top_size = "20 mm"
+"""
+
 COMPILED = not numba.config.DISABLE_JIT
 
 # A Kolmogorov-Smirnov distance above KS / sqrt(samples) happens by chance once in a million tests:

@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 import xarray as xr
-from support import SIGMAS, feed_values, paper
+from support import SCENE_TOML, SIGMAS, feed_values, paper
 
 from hpgr import kernels, parcels, pipeline
 from studies import accuracy, plots
@@ -265,22 +265,7 @@ def test_command_without_a_picture(run, tmp_path):
     assert "|" not in out
 
 
-SCENE = """
-{head}
-[rolls]
-diameter = "0.8 m"
-width = "0.25 m"
-gap = "19 mm"
-entry_gap = "163 mm"
-speed = "16 rpm"
-
-[feed]
-kind = "uniform"
-bottom_size = "1 mm"
-top_size = "20 mm"
-
-{tail}
-"""
+SCENE = "{head}" + SCENE_TOML + "\n{tail}\n"
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 import xarray as xr
+from support import SCENE_TOML as SCENE
 
 import hpgr
 from hpgr import pipeline
@@ -12,19 +13,6 @@ from studies import feed_sweep, gap_sweep, speed_sweep
 
 SMALL = ["--cells", "60", "--points", "40", "--streamlines", "3"]
 STUDIES = {"gap_sweep": gap_sweep, "speed_sweep": speed_sweep, "feed_sweep": feed_sweep}
-SCENE = """
-[rolls]
-diameter = "0.8 m"
-width = "0.25 m"
-gap = "19 mm"
-entry_gap = "163 mm"
-speed = "16 rpm"
-
-[feed]
-kind = "uniform"
-bottom_size = "1 mm"
-top_size = "20 mm"
-"""
 SINGLE = SCENE.replace("uniform", "single").replace('bottom_size = "1 mm"\ntop_size', "size")
 
 
