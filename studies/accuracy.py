@@ -800,7 +800,7 @@ def _write(result: "xr.Dataset", options: Options) -> list[Path]:
         store.write_dataset(result, out)
         if not options.plot:
             return [out]
-        from studies import plots
+        from studies.plots import accuracy as plots
 
         figure = plots.accuracy_figure(result)
         store.replace(out.with_suffix(".png"), lambda part: figure.savefig(part, dpi=150))

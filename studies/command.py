@@ -253,7 +253,7 @@ def _report(study: Study, options: Options, result: "xr.Dataset", sieve: float, 
         store.write_dataset(result, out)
         written = [out]
         if options.plot:
-            from studies import plots
+            from studies.plots import sweeps as plots
 
             figure = plots.sweep_figure(result, AXES[study.main], sieve, "\n".join(sayings))
             store.replace(out.with_suffix(".png"), lambda part: figure.savefig(part, dpi=150))

@@ -30,12 +30,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = tyro.cli(Options, prog="python -m studies.voronoi", description=__doc__, args=arguments)
     scene = base_scene(options.scene, points=options.points, streamlines=options.streamlines)
     from hpgr import flow, geometry, tessellation
-    from studies import plots, store
+    from studies import store
+    from studies.plots import bed as pictures
 
     bed = geometry.bed(scene.rolls, scene.resolution.streamlines)
     motion = flow.move(scene, bed, scene.resolution.points)
     cells = tessellation.tessellate(scene, bed, motion)
-    figure = plots.tessellation_figure(bed, motion, cells)
+    figure = pictures.tessellation_figure(bed, motion, cells)
     store.replace(options.out, lambda part: figure.savefig(part, dpi=150))
     print(f"{cells.volume.size} material points, {len(cells.pairs)} edges; volumes sum to {cells.volume.sum():.6g} m2")
     print(f"wrote {options.out}")

@@ -8,7 +8,8 @@ import xarray as xr
 from support import SCENE_TOML, SIGMAS, feed_values, paper
 
 from hpgr import kernels, parcels, pipeline
-from studies import accuracy, plots
+from studies import accuracy
+from studies.plots import accuracy as plots
 
 TINY = accuracy.Plan(
     held=(2, 26, 24),

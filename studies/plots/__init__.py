@@ -1,0 +1,1 @@
+"""Dataset -> Figure; the only matplotlib. One module per kind of study."""
