@@ -24,6 +24,7 @@ _HOMES = {
     "throughput": "metrics",
     "peak_pressure": "metrics",
     "reduction_ratio": "metrics",
+    "operating_gap": "machine",
 }
 
 __all__ = [*_HOMES, "presets"]

@@ -24,29 +24,37 @@ def paper() -> Scene:
 
 
 def khd_pilot() -> Scene:
-    """Return the KHD pilot rolls with porphyry, test P1 (Torres & Casali 2009). Uncalibrated.
-
-    Machine and feed are measured; strength and elasticity are still the paper's quartz, and the speed
-    profile its linear law. Pressure and fineness are therefore not predictions for this ore.
-
-    Source: Torres & Casali, "A novel approach for the modelling of high-pressure grinding rolls",
-    Minerals Engineering 22 (2009) 1137-1146, and the theses behind it.
-    """
+    """Return the KHD pilot rolls with porphyry, test P1 (Torres & Casali 2009). Uncalibrated."""
     return Scene(
         rolls=dict(
             diameter=0.80,  # Torres & Casali 2009
             width=0.25,  # Torres & Casali 2009
-            gap=0.0190,  # test P1, working gap
-            entry_gap=0.163,  # ours: the entry angle of the paper's machine, 34.9 degrees
+            gap=0.0237,  # test P1, thickness of the cake
+            entry_gap=0.051,  # ours: 15 degrees, above the nip
             speed=0.67 / 0.40,  # test P1, peripheral speed 0.67 m/s
         ),
         material=dict(
             solid_density=2740.0,  # Torres & Casali 2009, porphyry
             feed_solid_fraction=0.595,  # bulk density 1.63 t/m3 over 2.74 t/m3
+            max_solid_fraction=1.0,
+            bulk_modulus=600e6, shear_modulus=600e6*13.1/28.3,
         ),
+        flow=dict(profile="nip", cake_solid_fraction=0.84),
         feed=dict(kind="table", table=str(files("hpgr") / "data" / "khd_porphyry_feed.csv")),
-        note="uncalibrated: machine and feed are the KHD pilot's, strength and elasticity the paper's quartz",
+        note="uncalibrated",
     )
 
 
-PRESETS = {"paper": paper, "khd_pilot": khd_pilot}
+def industrial() -> Scene:
+    """Return an industrial machine, D 2.2 m, L 1.0 m."""
+    return Scene(
+        rolls=dict(diameter=2.2, width=1.0, gap=0.055, entry_gap=0.14, speed=1.364),
+        material=dict(solid_density=2740.0, feed_solid_fraction=0.595, max_solid_fraction=1.0,
+                      bulk_modulus=600e6, shear_modulus=600e6*13.1/28.3),
+        flow=dict(profile="nip", cake_solid_fraction=0.84),
+        feed=dict(kind="table", table=str(files("hpgr") / "data" / "khd_porphyry_feed.csv")),
+        note="uncalibrated",
+    )
+
+
+PRESETS = {"paper": paper, "khd_pilot": khd_pilot, "industrial": industrial}

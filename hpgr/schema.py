@@ -44,6 +44,15 @@ VARIABLES = {
     "shear_stress": Variable(_POINT, "Pa", "triaxial shear stress q"),
     "on_shear_limit": Variable(_POINT, "1", "whether shear beyond the convexity limit was taken as plastic", np.int8),
     "throughput": Variable((), "kg s-1", "solids through the whole gap"),
+    "pressing_force": Variable((), "N", "force that presses the rolls on the bed"),
+    "specific_pressing_force": Variable((), "Pa", "pressing force over roll diameter times width"),
+    "torque": Variable((), "N m", "torque of both drives"),
+    "power": Variable((), "W", "power of both drives"),
+    "specific_energy": Variable((), "J kg-1", "power over throughput"),
+    "specific_throughput": Variable((), "kg m-3", "throughput over roll diameter, width and surface speed"),
+    "nip_angle": Variable((), "rad", "roll angle above the minimum gap at which compaction begins"),
+    "force_angle": Variable((), "rad", "angle at which the pressing force would take the bed's power"),
+    "operating_gap": Variable((), "m", "gap that carries the pressing force"),
     "peak_pressure": Variable((), "Pa", "largest mean stress in the bed"),
     "peak_pressure_height": Variable((), "m", "height of the largest mean stress above the minimum gap"),
     "streamline_peak_pressure": Variable(("streamline",), "Pa", "largest mean stress on the streamline"),
@@ -82,6 +91,8 @@ FLAGS = {
     "size_floor_reached": 16,
     "few_cells": 32,
     "tension_clamped": 64,
+    "unusual_machine": 128,
+    "no_force_angle": 256,
 }
 
 
