@@ -115,7 +115,9 @@ def nip_angle(scene: Scene) -> float:
         return scene.flow.nip_angle
     gap, diameter = scene.rolls.gap, scene.rolls.diameter
     ratio = scene.flow.cake_solid_fraction / scene.material.feed_solid_fraction
-    return math.acos(((gap + diameter) + math.sqrt((gap + diameter) ** 2 - 4 * gap * diameter * ratio)) / (2 * diameter))
+    return math.acos(
+        ((gap + diameter) + math.sqrt((gap + diameter) ** 2 - 4 * gap * diameter * ratio)) / (2 * diameter)
+    )
 
 
 def move(scene: Scene, geometry: Geometry, points: int) -> Motion:
@@ -281,7 +283,9 @@ def _onset(scene: Scene, geometry: Geometry, motion: Motion) -> Onset:
     x_nip = geometry.xi[:, None] * geometry.outer(nip)
     arc = np.hypot(motion.x[:, 1:] - x_nip, motion.y[:, 1:] - nip)
     whole = motion.speed[:, 1:] * motion.time_step
-    fraction = np.where(motion.y[:, :-1] <= nip, 1.0, np.where(motion.y[:, 1:] < nip, np.minimum(arc / whole, 1.0), 0.0))
+    fraction = np.where(
+        motion.y[:, :-1] <= nip, 1.0, np.where(motion.y[:, 1:] < nip, np.minimum(arc / whole, 1.0), 0.0)
+    )
     return Onset(fraction, volumetric / unit_time, shear / unit_time)
 
 

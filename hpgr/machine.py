@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from hpgr import flow, geometry, stress, units
+from hpgr import flow, geometry, stress, units, width
 from hpgr.flow import Motion
 from hpgr.geometry import Geometry
 from hpgr.scene import Scene
@@ -126,7 +126,7 @@ def figures(scene: Scene, pressed: Press, throughput: float) -> Figures:
     """
     rolls = scene.rolls
     surface_speed = rolls.speed * rolls.diameter / 2
-    carried = rolls.width * mean_over_width(scene)
+    carried = rolls.width * width.mean_pressure(scene)
     force, bed_power = pressed.force * carried, pressed.power * carried
     power = bed_power + rolls.idle_torque * rolls.speed
     return Figures(
@@ -139,11 +139,6 @@ def figures(scene: Scene, pressed: Press, throughput: float) -> Figures:
         nip_angle=pressed.nip_angle,
         force_angle=math.asin(min(bed_power / (2 * force * surface_speed), 1.0)) if force > 0 else 0.0,
     )
-
-
-def mean_over_width(scene: Scene) -> float:
-    """Return the mean over the roll width of the pressure relative to that of its middle, 1 - kappa / 3."""
-    return 1.0 if scene.roll_width is None else 1 - scene.roll_width.pressure_drop / 3
 
 
 def unusual(scene: Scene, found: Figures, exit_solid_fraction: float) -> str:
@@ -178,7 +173,7 @@ def pressing_force(scene: Scene) -> float:
     points = (scene.resolution.points - 1) * scene.stress.substeps + 1
     motion = flow.move(scene, wall, points)
     force = _wall_force(scene, wall, motion, stress.load(scene, motion))
-    return force * mean_over_width(scene) / scene.rolls.diameter
+    return force * width.mean_pressure(scene) / scene.rolls.diameter
 
 
 def operating_gap(scene: Scene, specific_pressing_force: float | str) -> float:

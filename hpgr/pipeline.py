@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hpgr import exchange, flow, geometry, machine, metrics, schema, solve, stress, tessellation
+from hpgr import exchange, flow, geometry, machine, metrics, schema, solve, stress, tessellation, width
 from hpgr.scene import Scene
 
 _NIPPING = 1.5  # top size over gap above which rolls nip single grains, which is not modelled
@@ -167,12 +167,27 @@ def _product(scene: Scene, crushed: solve.Crushed | None) -> dict[str, Any]:
         "breaks_per_cell": crushed.breaks,
         "below_floor": crushed.below_floor,
     }
+    if crushed.along_width is not None:
+        values |= _along_width(scene, crushed.along_width)
     exchanged = crushed.exchanged
     if exchanged is not None:
         values |= {"swaps_per_cell": exchanged.swaps_per_cell, "exchange_passes": exchanged.passes}
         if frames is not None:
             values |= {"elapsed_time": exchanged.elapsed_time, "steady": exchanged.steady}
     return values
+
+
+def _along_width(scene: Scene, found: solve.AlongWidth) -> dict[str, Any]:
+    return {
+        "width_position": width.slices_of(scene).position,
+        "passing_slice": found.passing,
+        "passing_width_centre": found.centre_passing,
+        "passing_width_edge": found.edge_passing,
+        "p50_width_centre": found.centre_percentiles[0],
+        "p80_width_centre": found.centre_percentiles[1],
+        "p50_width_edge": found.edge_percentiles[0],
+        "p80_width_edge": found.edge_percentiles[1],
+    }
 
 
 def _notes(scene: Scene, prepared: Prepared, crushed: solve.Crushed | None) -> dict[str, str]:

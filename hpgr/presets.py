@@ -37,7 +37,8 @@ def khd_pilot() -> Scene:
             solid_density=2740.0,  # Torres & Casali 2009, porphyry
             feed_solid_fraction=0.595,  # bulk density 1.63 t/m3 over 2.74 t/m3
             max_solid_fraction=1.0,
-            bulk_modulus=600e6, shear_modulus=600e6*13.1/28.3,
+            bulk_modulus=600e6,
+            shear_modulus=600e6 * 13.1 / 28.3,
         ),
         flow=dict(profile="nip", cake_solid_fraction=0.84),
         feed=dict(kind="table", table=str(files("hpgr") / "data" / "khd_porphyry_feed.csv")),
@@ -49,8 +50,13 @@ def industrial() -> Scene:
     """Return an industrial machine, D 2.2 m, L 1.0 m."""
     return Scene(
         rolls=dict(diameter=2.2, width=1.0, gap=0.055, entry_gap=0.14, speed=1.364),
-        material=dict(solid_density=2740.0, feed_solid_fraction=0.595, max_solid_fraction=1.0,
-                      bulk_modulus=600e6, shear_modulus=600e6*13.1/28.3),
+        material=dict(
+            solid_density=2740.0,
+            feed_solid_fraction=0.595,
+            max_solid_fraction=1.0,
+            bulk_modulus=600e6,
+            shear_modulus=600e6 * 13.1 / 28.3,
+        ),
         flow=dict(profile="nip", cake_solid_fraction=0.84),
         feed=dict(kind="table", table=str(files("hpgr") / "data" / "khd_porphyry_feed.csv")),
         note="uncalibrated",

@@ -510,7 +510,9 @@ class Flow(_Frozen):
         given = [name for name in ("nip_angle", "cake_solid_fraction") if known.get(name) is not None]
         if known.get("profile") == "power":
             for name in given:
-                yield Fault(name, f"{known[name]:g}", "profile 'power' has no nip", "leave it out, or take profile 'nip'")
+                yield Fault(
+                    name, f"{known[name]:g}", "profile 'power' has no nip", "leave it out, or take profile 'nip'"
+                )
         if known.get("profile") == "nip" and len(given) != 1 and {"nip_angle", "cake_solid_fraction"} <= known.keys():
             yield Fault("nip_angle", " and ".join(given) or "nothing", "profile 'nip' needs either nip_angle or "
                         "cake_solid_fraction", "give one of them, such as cake_solid_fraction = 0.85")  # fmt: skip

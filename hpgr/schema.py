@@ -28,6 +28,9 @@ COORDINATES = {
     "height": Variable(_POINT, "m", "height above the minimum gap", np.float64),
     "residence_time": Variable(_POINT, "s", "time since the first material point", np.float64),
     "sieve": Variable(("sieve",), "m", "sieve size", np.float64),
+    "width_position": Variable(
+        ("slice",), "1", "distance from the middle of the roll width over half of it", np.float64
+    ),
 }
 
 VARIABLES = {
@@ -67,6 +70,13 @@ VARIABLES = {
     "p80": Variable(("streamline",), "m", "product size that 80 % of the mass passes"),
     "p50_total": Variable((), "m", "product size that 50 % of the mass passes, whole gap"),
     "p80_total": Variable((), "m", "product size that 80 % of the mass passes, whole gap"),
+    "passing_slice": Variable(("slice", "sieve"), "1", "mass fraction of the product of a slice of the width passing"),
+    "passing_width_centre": Variable(("sieve",), "1", "mass fraction of the product passing, centre of the roll width"),
+    "passing_width_edge": Variable(("sieve",), "1", "mass fraction of the product passing, edge of the roll width"),
+    "p50_width_centre": Variable((), "m", "product size that 50 % of the mass passes, centre of the roll width"),
+    "p80_width_centre": Variable((), "m", "product size that 80 % of the mass passes, centre of the roll width"),
+    "p50_width_edge": Variable((), "m", "product size that 50 % of the mass passes, edge of the roll width"),
+    "p80_width_edge": Variable((), "m", "product size that 80 % of the mass passes, edge of the roll width"),
     "breaks_per_cell": Variable(("streamline",), "1", "mean number of breaks of a cell"),
     "below_floor": Variable(("streamline",), "1", "fraction of the product below the size floor, where nothing breaks"),
     "volume": Variable(_POINT, "m2", "area of the Voronoi cell of the material point, volume per roll width"),

@@ -18,7 +18,14 @@ SHOWN = {
 
 # pint's spelling of the CF-style units that fields carry
 _PINT = {"rad s-1": "rad/s", "kg m-3": "kg/m^3", "m": "m", "Pa": "Pa", "rad": "rad", "N m": "N*m"}
-_EXAMPLES = {"rad s-1": "19 rpm", "kg m-3": "2.7 g/cm^3", "m": "60 mm", "Pa": "0.84 MPa", "rad": "9 deg", "N m": "2 kN*m"}
+_EXAMPLES = {
+    "rad s-1": "19 rpm",
+    "kg m-3": "2.7 g/cm^3",
+    "m": "60 mm",
+    "Pa": "0.84 MPa",
+    "rad": "9 deg",
+    "N m": "2 kN*m",
+}
 
 # stricter than pint, which reads past what it does not understand ("60; mm") and sums up ("60 mm + 1 m")
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|[+-]?(?:nan|inf)(?=\s)"
