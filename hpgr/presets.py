@@ -1,8 +1,11 @@
 """Ready scenes, data only; every figure has its source beside it."""
 
 from importlib.resources import files
+from pathlib import Path
 
 from hpgr.scene import Scene
+
+DATA = Path(str(files("hpgr") / "data"))  # pilot tests and feed of the porphyry, as CSV
 
 
 def paper() -> Scene:

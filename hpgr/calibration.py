@@ -1,0 +1,392 @@
+"""Calibrate ore and machine to pilot tests, and predict other tests.
+
+What is fitted is the least squares of the percent passing of the product (centre and edge of the roll width, and
+total, where measured) together with the percent by which throughput, power and cake thickness are off: one percent of
+these weighs as one percent passing. Force and speed of a test are set, as on the machine; the gap follows.
+Every evaluation draws the same random numbers, so the objective is smooth.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from hpgr import machine, pipeline, solve, units
+from hpgr.scene import Feed, Scene, field_info
+from hpgr.tables import PilotTest, read_pilot_tests
+
+_STEPS = (0.03, 0.01)  # of central differences, in the units below: wide first, or counting cells would show
+_LOST = 1e3  # percent that a trial is off whose force no gap carries: it is never taken
+_CONFIDENCE = 0.95
+_UNDETERMINED = 1e-6  # least singular value over the largest below which tests do not tell parameters apart
+
+
+class Parameter(NamedTuple):
+    """A parameter that can be fitted.
+
+    Attributes
+    ----------
+    field : str
+        Scene field.
+    low, high : float
+        Bounds, in the field's unit.
+    logarithmic : bool
+        Whether its logarithm is fitted; else the value in units of `high`.
+    follower : str
+        Scene field that keeps its ratio to this one.
+    """
+
+    field: str
+    low: float
+    high: float
+    logarithmic: bool = True
+    follower: str = ""
+
+    def scaled(self, value: float) -> float:
+        """Return the number that is fitted."""
+        return math.log(value) if self.logarithmic else value / self.high
+
+    def value(self, scaled: float) -> float:
+        """Return the field's value of a fitted number."""
+        return math.exp(scaled) if self.logarithmic else scaled * self.high
+
+
+PARAMETERS = {
+    "sigma_m": Parameter("material.strength", 1e3, 1e10),
+    "w": Parameter("material.weibull_modulus", 0.05, 100.0),
+    "gamma": Parameter("material.fragment_exponent", 0.02, 20.0),
+    "n": Parameter("material.cushioning", 0.05, 100.0),
+    "K": Parameter("material.bulk_modulus", 1e5, 1e12, follower="material.shear_modulus"),
+    "alpha": Parameter("flow.nip_angle", math.radians(1), math.radians(45)),
+    "kappa": Parameter("roll_width.pressure_drop", 0.0, 1.0, logarithmic=False),
+    "T_0": Parameter("rolls.idle_torque", 0.0, 1e5, logarithmic=False),
+}
+
+
+class Estimate(NamedTuple):
+    """A fitted value with its 95 % confidence interval, in SI; the interval is infinite where tests do not tell."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+
+
+class Prediction(NamedTuple):
+    """What a scene says of a test: SI; size distributions (size,) at the test's sieves, fractions.
+
+    `centre` and `edge` are of the roll width, None for a scene without one.
+    """
+
+    gap: float
+    throughput: float
+    power: float
+    specific_energy: float
+    centre: np.ndarray | None
+    edge: np.ndarray | None
+    total: np.ndarray
+
+
+class Calibration(NamedTuple):
+    """A scene fitted to pilot tests.
+
+    Attributes
+    ----------
+    scene : Scene
+        The scene with the fitted values; its feed, speed and force are those of the first test.
+    estimates : dict
+        Fitted values by symbol.
+    residuals : dict
+        By test and measured quantity ("centre", "edge", "total": percent passing, (size,); "throughput", "power",
+        "cake_thickness": percent), predicted less measured.
+    at_bound : tuple
+        Symbols of the fitted values that ended at a bound.
+    undetermined : tuple
+        Symbols whose values the tests do not tell apart.
+    """
+
+    scene: Scene
+    estimates: dict[str, Estimate]
+    residuals: dict[str, dict[str, np.ndarray]]
+    at_bound: tuple[str, ...]
+    undetermined: tuple[str, ...]
+
+    def predict(self, test: PilotTest) -> Prediction:
+        """Return what the fitted scene says of a test, from its feed, speed and force alone."""
+        return predict(self.scene, test)
+
+    def __str__(self) -> str:
+        lines = [f"calibrated on {', '.join(self.residuals)}"]
+        for name, found in self.estimates.items():
+            value, low, high = (units.show(one, found.unit) for one in found[:3])
+            told = " (at its bound)" if name in self.at_bound else ""
+            lines.append(f"{name:>8} = {value} ({low} to {high}){told}")
+        if self.undetermined:
+            lines.append(f"the tests do not tell apart {', '.join(self.undetermined)}")
+        return "\n".join(lines)
+
+
+def calibrate(
+    scene: Scene,
+    feed: Feed | None,
+    product: str | Path,
+    operations: str | Path,
+    fit: Sequence[str] = ("sigma_m", "w", "gamma", "K"),
+    tests: Sequence[str] | None = None,
+) -> Calibration:
+    """Fit parameters of `scene` to the pilot tests of two CSV files.
+
+    Parameters
+    ----------
+    scene : Scene
+        Machine, ore and resolution to start from. With profile "nip" it needs a nip angle or a cake density, and with
+        `roll_width` centre and edge of the width are told apart.
+    feed : Feed, optional
+        Feed of all tests; default each test's own.
+    product, operations : path
+        Tables as `hpgr.tables.read_pilot_tests` takes them.
+    fit : sequence of str
+        Symbols to fit: sigma_m, w, gamma, n, K (G keeps its ratio to it), alpha (nip angle), kappa (roll width), T_0
+        (idle torque).
+    tests : sequence of str, optional
+        Names of the tests to fit to; default all.
+
+    Returns
+    -------
+    Calibration
+        Estimates with 95 % confidence intervals from the curvature at the minimum. They take residuals as independent,
+        which those of one cumulative curve are not: they are too narrow rather than too wide.
+
+    Raises
+    ------
+    OSError, ValueError
+        If a table cannot be read, a name is unknown, there are fewer measured values than parameters, or the scene
+        cannot carry the tests' forces to begin with.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> folder = hpgr.presets.DATA
+    >>> coarse = {"resolution.points": 40, "resolution.streamlines": 1, "material.cushioning": float("inf")}
+    >>> scene = hpgr.presets.khd_pilot().with_values(coarse)
+    >>> product, operations = folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv"
+    >>> found = hpgr.calibrate(scene, None, product, operations, fit=["sigma_m", "gamma"], tests=["K-P1"])
+    >>> list(found.estimates)
+    ['sigma_m', 'gamma']
+    """
+    known = {test.name: test for test in read_pilot_tests(product, operations)}
+    unknown = [name for name in tests or () if name not in known]
+    if unknown:
+        raise ValueError(f"tests: got {unknown[0]!r}; must be of {', '.join(known)}; correct the name")
+    return fit_tests(scene, [known[name] for name in tests or known], fit, feed)
+
+
+def fit_tests(scene: Scene, tests: Sequence[PilotTest], fit: Sequence[str], feed: Feed | None = None) -> Calibration:
+    """Fit parameters of `scene` to tests, as `calibrate` does to those of files."""
+    names = _known_names(scene, fit)
+    scene = scene.with_values({"resolution.record": "product"})
+    cases = [_at_test(scene, test, feed) for test in tests]
+    start = np.array([PARAMETERS[name].scaled(_value_of(scene, name)) for name in names])
+    bounds = np.array([[PARAMETERS[name].scaled(max(PARAMETERS[name].low, 1e-300)) if PARAMETERS[name].logarithmic
+                        else 0.0 for name in names],
+                       [PARAMETERS[name].scaled(PARAMETERS[name].high) for name in names]])  # fmt: skip
+
+    def residuals(without_cushioning: bool) -> Callable[[np.ndarray], np.ndarray]:
+        def function(scaled: np.ndarray) -> np.ndarray:
+            values = _values(scene, names, scaled)
+            if without_cushioning:
+                values["material.cushioning"] = math.inf
+            return np.concatenate([_flat(one, test, values) for one, test in zip(cases, tests, strict=True)])
+
+        return function
+
+    _refuse_unfit(residuals(True)(start), start, names)
+    place = start
+    if solve.choose(scene) == "march":  # the closed form gives the starting point
+        free = [k for k, name in enumerate(names) if name != "n"]
+        place = _minimise(residuals(True), place, bounds, free, _STEPS[:1])
+    objective = residuals(math.isinf(_values(scene, names, start).get("material.cushioning", scene.material.cushioning)))
+    place = _minimise(objective, place, bounds, range(len(names)), _STEPS)
+    return _calibration(scene, cases, tests, names, place, bounds, objective)
+
+
+def predict(scene: Scene, test: PilotTest, feed: Feed | None = None, floating: bool = True) -> Prediction:
+    """Return what `scene` says of a test, from its feed, speed and force.
+
+    With `floating` off, the gap is the test's cake thickness, or its working gap where that was not measured, and the
+    force follows instead.
+    """
+    return _predict(_at_test(scene.with_values({"resolution.record": "product"}), test, feed, floating))
+
+
+def _at_test(scene: Scene, test: PilotTest, feed: Feed | None, floating: bool = True) -> Scene:
+    """Return the scene at the speed, force and feed of a test, with its sieves."""
+    table = tuple((size, 100 * part) for size, part in zip(test.sizes.tolist(), test.feed.tolist(), strict=True))
+    known = ~np.isnan(test.feed)
+    values: dict[str, Any] = {
+        "rolls.speed": test.surface_speed / (scene.rolls.diameter / 2),
+        "rolls.specific_pressing_force": test.specific_pressing_force if floating else None,
+        "feed": feed or Feed(kind="table", table=[row for row, here in zip(table, known, strict=True) if here]),
+        "resolution.sieves": tuple(test.sizes.tolist()),
+    }
+    if scene.flow.cake_solid_fraction is not None:  # the angle is the ore's; it is held while the gap floats
+        from hpgr import flow
+
+        values |= {"flow.nip_angle": flow.nip_angle(scene), "flow.cake_solid_fraction": None}
+    if not floating:
+        values["rolls.gap"] = test.gap if math.isnan(test.cake_thickness) else test.cake_thickness
+    return scene.with_values(values)
+
+
+def _predict(scene: Scene) -> Prediction:
+    scene = machine.at_operating_gap(scene)
+    values = pipeline.crush(scene, pipeline.prepare(scene), 0, 0)
+    apart = [None if values.get(name) is None else np.asarray(values[name])
+             for name in ("passing_width_centre", "passing_width_edge")]  # fmt: skip
+    return Prediction(
+        scene.rolls.gap, float(values["throughput"]), float(values["power"]), float(values["specific_energy"]), *apart,
+        np.asarray(values["passing_total"]),
+    )  # fmt: skip
+
+
+def _residuals(found: Prediction, test: PilotTest) -> dict[str, np.ndarray]:
+    """Return by what each measured quantity is missed, in percent passing or percent."""
+    off = {}
+    for name in ("centre", "edge", "total"):
+        part, measured = getattr(found, name), getattr(test, name)
+        if part is not None and not np.isnan(measured).all():
+            off[name] = 100 * (part - measured)
+    for name, value in (("throughput", found.throughput), ("power", found.power), ("cake_thickness", found.gap)):
+        measured = getattr(test, name)
+        if not math.isnan(measured):
+            off[name] = np.array([100 * (value / measured - 1)])
+    return off
+
+
+def _flat(scene: Scene, test: PilotTest, values: dict[str, Any]) -> np.ndarray:
+    """Return all residuals of a test in a line, those not measured left out."""
+    try:
+        found = _predict(scene.with_values(values))
+    except ValueError:  # no gap carries the force
+        found = None
+    blank = Prediction(*(math.inf,) * 4, *(np.full(test.sizes.size, math.inf),) * 3) if found is None else found
+    if scene.roll_width is None:
+        blank = blank._replace(centre=None, edge=None)
+    flat = np.concatenate(list(_residuals(blank, test).values()))
+    return np.where(np.isfinite(flat), flat, _LOST)[~np.isnan(flat)]
+
+
+def _minimise(function, start: np.ndarray, bounds: np.ndarray, free, steps) -> np.ndarray:
+    """Return the place of the least squares over the free numbers, with ever narrower differences."""
+    free, place = list(free), start.copy()
+
+    def at(part: np.ndarray) -> np.ndarray:
+        whole = place.copy()
+        whole[free] = part
+        return whole
+
+    for step in steps:
+        found = least_squares(
+            lambda part: function(at(part)), place[free], bounds=bounds[:, free], xtol=1e-4, ftol=1e-5, max_nfev=40,
+            jac=lambda part, step=step: _slopes(function, at(part), bounds, free, step),
+        )  # fmt: skip
+        place = at(found.x)
+    return place
+
+
+def _slopes(function, place: np.ndarray, bounds: np.ndarray, free, step: float) -> np.ndarray:
+    """Return the derivatives (residual, free) by central differences that stay within the bounds."""
+    columns = []
+    for k in free:
+        ends = [place.copy(), place.copy()]
+        ends[0][k], ends[1][k] = max(place[k] - step, bounds[0, k]), min(place[k] + step, bounds[1, k])
+        low, high = (function(end) for end in ends)
+        columns.append((high - low) / (ends[1][k] - ends[0][k]))
+    return np.array(columns).T
+
+
+def _calibration(scene, cases, tests, names, place, bounds, objective) -> Calibration:
+    residual = objective(place)
+    slopes = _slopes(objective, place, bounds, range(len(names)), _STEPS[0])
+    spread, lost = _spread(residual, slopes)
+    estimates = {}
+    for k, name in enumerate(names):
+        parameter = PARAMETERS[name]
+        ends = (parameter.value(min(max(place[k] + side * spread[k], -700.0), 700.0)) for side in (-1, 1))
+        low, high = ends if math.isfinite(spread[k]) else (0.0, math.inf)
+        estimates[name] = Estimate(parameter.value(place[k]), max(low, 0.0), high, field_info(parameter.field).unit)
+    values = _values(scene, names, place)
+    fitted = [one.with_values(values) for one in cases]
+    close = 1e-3 * (bounds[1] - bounds[0])
+    return Calibration(
+        fitted[0],
+        estimates,
+        {test.name: _residuals(_predict(one), test) for one, test in zip(fitted, tests, strict=True)},
+        tuple(name for k, name in enumerate(names) if min(place[k] - bounds[0, k], bounds[1, k] - place[k]) < close[k]),
+        tuple(name for name, k in zip(names, lost, strict=True) if k),
+    )
+
+
+def _spread(residual: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return half the width of each confidence interval, and which numbers the tests do not determine."""
+    from scipy.stats import t  # late: importing it costs 0.3 s
+
+    _, singular, axes = np.linalg.svd(slopes, full_matrices=False)
+    told = singular > _UNDETERMINED * singular[0]
+    freedom = residual.size - singular.size
+    variance = residual @ residual / freedom
+    inverse = np.where(told, 1 / np.where(told, singular, 1.0), 0.0)
+    spread = t.ppf((1 + _CONFIDENCE) / 2, freedom) * np.sqrt(variance * ((inverse[:, None] * axes) ** 2).sum(axis=0))
+    lost = (np.abs(axes[~told]) > 0.1).any(axis=0) if not told.all() else np.zeros(singular.size, bool)
+    return np.where(lost, math.inf, spread), lost
+
+
+def _known_names(scene: Scene, fit: Sequence[str]) -> list[str]:
+    names = list(dict.fromkeys(fit))
+    unknown = [name for name in names if name not in PARAMETERS]
+    if unknown or not names:
+        raise ValueError(f"fit: got {', '.join(unknown) or 'nothing'}; must be of {', '.join(PARAMETERS)}; name some")
+    if "alpha" in names and scene.flow.profile != "nip":
+        raise ValueError("fit: got alpha; must be fitted with flow.profile = 'nip'; leave it out or take that profile")
+    if "kappa" in names and scene.roll_width is None:
+        raise ValueError("fit: got kappa; must be fitted with a roll_width; leave it out or give the scene one")
+    return names
+
+
+def _value_of(scene: Scene, name: str) -> float:
+    """Return the value to start from."""
+    if name == "alpha":
+        from hpgr import flow
+
+        return flow.nip_angle(scene)
+    part, key = PARAMETERS[name].field.split(".")
+    value = getattr(getattr(scene, part), key)
+    return min(max(value, PARAMETERS[name].low), PARAMETERS[name].high if name != "n" else 1.0)
+
+
+def _values(scene: Scene, names: Sequence[str], scaled: np.ndarray) -> dict[str, Any]:
+    """Return the scene fields of fitted numbers, followers included."""
+    values = {}
+    for name, number in zip(names, scaled, strict=True):
+        parameter = PARAMETERS[name]
+        values[parameter.field] = parameter.value(float(number))
+        if parameter.follower:
+            part, key = parameter.follower.split(".")
+            ratio = getattr(getattr(scene, part), key) / _value_of(scene, name)
+            values[parameter.follower] = ratio * values[parameter.field]
+    return values
+
+
+def _refuse_unfit(residual: np.ndarray, start: np.ndarray, names: Sequence[str]) -> None:
+    if residual.size <= start.size:
+        raise ValueError(
+            f"fit: got {len(names)} parameters; must be fewer than the {residual.size} measured values; name fewer"
+        )
+    if (residual == _LOST).any():
+        raise ValueError(
+            "scene: no gap carries the force of every test at the start; must be so to begin the fit; start from another "
+            "bulk modulus (material.bulk_modulus, such as '600 MPa') or nip angle"
+        )
