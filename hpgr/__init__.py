@@ -25,6 +25,7 @@ _HOMES = {
     "peak_pressure": "metrics",
     "reduction_ratio": "metrics",
     "operating_gap": "machine",
+    "calibrate": "calibration",
 }
 
 __all__ = [*_HOMES, "presets"]

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from hpgr import machine, pipeline, solve, units
+from hpgr import flow, machine, pipeline, solve, units
 from hpgr.scene import Feed, Scene, field_info
 from hpgr.tables import PilotTest, read_pilot_tests
 
@@ -190,9 +190,8 @@ def fit_tests(scene: Scene, tests: Sequence[PilotTest], fit: Sequence[str], feed
     scene = scene.with_values({"resolution.record": "product"})
     cases = [_at_test(scene, test, feed) for test in tests]
     start = np.array([PARAMETERS[name].scaled(_value_of(scene, name)) for name in names])
-    bounds = np.array([[PARAMETERS[name].scaled(max(PARAMETERS[name].low, 1e-300)) if PARAMETERS[name].logarithmic
-                        else 0.0 for name in names],
-                       [PARAMETERS[name].scaled(PARAMETERS[name].high) for name in names]])  # fmt: skip
+    bounds = np.array([[PARAMETERS[name].scaled(getattr(PARAMETERS[name], end)) for name in names]
+                       for end in ("low", "high")])  # fmt: skip
 
     def residuals(without_cushioning: bool) -> Callable[[np.ndarray], np.ndarray]:
         def function(scaled: np.ndarray) -> np.ndarray:
@@ -208,7 +207,7 @@ def fit_tests(scene: Scene, tests: Sequence[PilotTest], fit: Sequence[str], feed
     if solve.choose(scene) == "march":  # the closed form gives the starting point
         free = [k for k, name in enumerate(names) if name != "n"]
         place = _minimise(residuals(True), place, bounds, free, _STEPS[:1])
-    objective = residuals(math.isinf(_values(scene, names, start).get("material.cushioning", scene.material.cushioning)))
+    objective = residuals(False)
     place = _minimise(objective, place, bounds, range(len(names)), _STEPS)
     return _calibration(scene, cases, tests, names, place, bounds, objective)
 
@@ -233,8 +232,6 @@ def _at_test(scene: Scene, test: PilotTest, feed: Feed | None, floating: bool = 
         "resolution.sieves": tuple(test.sizes.tolist()),
     }
     if scene.flow.cake_solid_fraction is not None:  # the angle is the ore's; it is held while the gap floats
-        from hpgr import flow
-
         values |= {"flow.nip_angle": flow.nip_angle(scene), "flow.cake_solid_fraction": None}
     if not floating:
         values["rolls.gap"] = test.gap if math.isnan(test.cake_thickness) else test.cake_thickness
@@ -359,8 +356,6 @@ def _known_names(scene: Scene, fit: Sequence[str]) -> list[str]:
 def _value_of(scene: Scene, name: str) -> float:
     """Return the value to start from."""
     if name == "alpha":
-        from hpgr import flow
-
         return flow.nip_angle(scene)
     part, key = PARAMETERS[name].field.split(".")
     value = getattr(getattr(scene, part), key)
@@ -387,6 +382,6 @@ def _refuse_unfit(residual: np.ndarray, start: np.ndarray, names: Sequence[str])
         )
     if (residual == _LOST).any():
         raise ValueError(
-            "scene: no gap carries the force of every test at the start; must be so to begin the fit; start from another "
-            "bulk modulus (material.bulk_modulus, such as '600 MPa') or nip angle"
+            "scene: no gap carries the force of every test at the start; must be so to begin the fit; start from "
+            "another bulk modulus (material.bulk_modulus, such as '600 MPa') or nip angle"
         )

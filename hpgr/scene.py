@@ -807,9 +807,10 @@ def _nip_faults(known: dict[str, Any]) -> Iterator[Fault]:
     if cake is not None and feed is not None:
         room = (gap + diameter) ** 2 - 4 * gap * diameter * cake / feed
         if room < 0:
+            densest = feed * (gap + diameter) ** 2 / (4 * gap * diameter)
             yield Fault("flow.cake_solid_fraction", f"{cake:g}",
-                        f"no nip angle feeds so dense a cake; must be at most "
-                        f"{feed * (gap + diameter) ** 2 / (4 * gap * diameter):.3g}", "give a thinner cake or gap")  # fmt: skip
+                        f"no nip angle feeds so dense a cake; must be at most {densest:.3g}",
+                        "give a lighter cake or a narrower gap")  # fmt: skip
             return
         angle = math.acos(min((gap + diameter + math.sqrt(room)) / (2 * diameter), 1.0))
     if angle is not None and known.get("rolls.specific_pressing_force") is None and gap < entry_gap:
