@@ -21,6 +21,9 @@ from hpgr.tables import PilotTest, read_pilot_tests
 _STEPS = (0.03, 0.01)  # of central differences, in the units below: wide first, or counting cells would show
 _LOST = 1e3  # percent that a trial is off whose force no gap carries: it is never taken
 _CONFIDENCE = 0.95
+_MODULI = ("bulk_modulus", "shear_modulus")
+_CRITICAL = 0.9  # part of the product below the size that the middle of the roll width just breaks, to start from
+_BEDS = 64  # loaded beds kept while fitting
 _UNDETERMINED = 1e-6  # least singular value over the largest below which tests do not tell parameters apart
 
 
@@ -187,18 +190,22 @@ def calibrate(
 def fit_tests(scene: Scene, tests: Sequence[PilotTest], fit: Sequence[str], feed: Feed | None = None) -> Calibration:
     """Fit parameters of `scene` to tests, as `calibrate` does to those of files."""
     names = _known_names(scene, fit)
-    scene = scene.with_values({"resolution.record": "product"})
+    scene = _started(scene.with_values({"resolution.record": "product"}), names, tests[0], feed)
     cases = [_at_test(scene, test, feed) for test in tests]
     start = np.array([PARAMETERS[name].scaled(_value_of(scene, name)) for name in names])
     bounds = np.array([[PARAMETERS[name].scaled(getattr(PARAMETERS[name], end)) for name in names]
                        for end in ("low", "high")])  # fmt: skip
+
+    beds: dict[tuple, tuple[Scene, pipeline.Prepared]] = {}
 
     def residuals(without_cushioning: bool) -> Callable[[np.ndarray], np.ndarray]:
         def function(scaled: np.ndarray) -> np.ndarray:
             values = _values(scene, names, scaled)
             if without_cushioning:
                 values["material.cushioning"] = math.inf
-            return np.concatenate([_flat(one, test, values) for one, test in zip(cases, tests, strict=True)])
+            if len(beds) > _BEDS:
+                beds.clear()
+            return np.concatenate([_flat(one, test, values, beds) for one, test in zip(cases, tests, strict=True)])
 
         return function
 
@@ -238,9 +245,16 @@ def _at_test(scene: Scene, test: PilotTest, feed: Feed | None, floating: bool = 
     return scene.with_values(values)
 
 
-def _predict(scene: Scene) -> Prediction:
-    scene = machine.at_operating_gap(scene)
-    values = pipeline.crush(scene, pipeline.prepare(scene), 0, 0)
+def _predict(scene: Scene, beds: dict[tuple, tuple[Scene, pipeline.Prepared]] | None = None) -> Prediction:
+    """Predict; `beds` keeps the loaded beds of trials, which those of another strength share (2 x faster)."""
+    beds = {} if beds is None else beds
+    key = (*pipeline.bed_key(scene), scene.roll_width)
+    if key not in beds:
+        held = machine.at_operating_gap(scene)
+        beds[key] = held, pipeline.prepare(held)
+    held, prepared = beds[key]
+    scene = scene.model_copy(update={"rolls": held.rolls, "flow": held.flow})
+    values = pipeline.crush(scene, prepared, 0, 0)
     apart = [None if values.get(name) is None else np.asarray(values[name])
              for name in ("passing_width_centre", "passing_width_edge")]  # fmt: skip
     return Prediction(
@@ -263,10 +277,10 @@ def _residuals(found: Prediction, test: PilotTest) -> dict[str, np.ndarray]:
     return off
 
 
-def _flat(scene: Scene, test: PilotTest, values: dict[str, Any]) -> np.ndarray:
+def _flat(scene: Scene, test: PilotTest, values: dict[str, Any], beds: dict) -> np.ndarray:
     """Return all residuals of a test in a line, those not measured left out."""
     try:
-        found = _predict(scene.with_values(values))
+        found = _predict(scene.with_values(values), beds)
     except ValueError:  # no gap carries the force
         found = None
     blank = Prediction(*(math.inf,) * 4, *(np.full(test.sizes.size, math.inf),) * 3) if found is None else found
@@ -274,6 +288,35 @@ def _flat(scene: Scene, test: PilotTest, values: dict[str, Any]) -> np.ndarray:
         blank = blank._replace(centre=None, edge=None)
     flat = np.concatenate(list(_residuals(blank, test).values()))
     return np.where(np.isfinite(flat), flat, _LOST)[~np.isnan(flat)]
+
+
+def _started(scene: Scene, names: Sequence[str], test: PilotTest, feed: Feed | None) -> Scene:
+    """Return the scene with starting values that a test tells by itself: nip angle, moduli, strength."""
+    cake = test.gap if math.isnan(test.cake_thickness) else test.cake_thickness
+    if math.isnan(cake):
+        return scene
+    if "alpha" in names and not math.isnan(test.throughput):
+        rolls, ore = scene.rolls, scene.material
+        solid = test.throughput / (ore.solid_density * cake * rolls.width * test.surface_speed)
+        if ore.feed_solid_fraction < solid <= ore.max_solid_fraction:  # else the working gap was no cake's thickness
+            values = {"rolls.gap": cake, "flow.cake_solid_fraction": solid, "flow.nip_angle": None}
+            angle = flow.nip_angle(scene.with_values(values | {"rolls.specific_pressing_force": 1.0}))
+            scene = scene.with_values({"flow.nip_angle": angle, "flow.cake_solid_fraction": None})
+    here = _at_test(scene, test, feed, floating=False).with_values({"resolution.cells": 0})
+    if "K" in names:
+        force = machine.pressing_force(here)  # proportional to the moduli
+        if force > 0:
+            factor = test.specific_pressing_force / force
+            stiffer = {f"material.{name}": factor * getattr(scene.material, name) for name in _MODULI}
+            scene, here = scene.with_values(stiffer), here.with_values(stiffer)
+    if "sigma_m" in names:
+        pressure = float(pipeline.prepare(here).crushing.max())
+        critical = float(np.interp(_CRITICAL, test.total, test.sizes))
+        slope = 3 / scene.material.weibull_modulus
+        if pressure > 0:
+            strength = pressure * (critical / scene.material.strength_size) ** slope
+            scene = scene.with_values({"material.strength": min(max(strength, 1e4), 1e9)})
+    return scene
 
 
 def _minimise(function, start: np.ndarray, bounds: np.ndarray, free, steps) -> np.ndarray:
