@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy import linalg, optimize
+from scipy import optimize
 
 from hpgr.tables import PilotTest
 
@@ -169,7 +169,23 @@ def block_products(parameters, sizes, feed, specific_energy, reference_size) -> 
     matrix = breakage(parameters, sizes) * rates - np.diag(rates)
     masses = -np.diff(np.asarray(feed)[::-1], append=0.0)
     energies, which = np.unique(specific_energy, return_inverse=True)  # the two halves of the width are alike
-    return (linalg.expm(energies[:, None, None] * matrix) @ masses)[which]
+    return (_exponentials(energies[:, None, None] * matrix) @ masses)[which]
+
+
+def _exponentials(matrices: np.ndarray) -> np.ndarray:
+    """Return the exponentials of a stack of matrices, by scaling, 14 terms of the series, and squaring.
+
+    scipy.linalg.expm walks through a stack one matrix after another: 6 times slower here, and a fit is
+    little else.
+    """
+    squarings = max(0, math.ceil(math.log2(np.abs(matrices).sum(axis=-2).max() / 0.5 + 1e-300)))
+    scaled, one = matrices / 2.0**squarings, np.eye(matrices.shape[-1])
+    result = one + scaled / 14  # the first term left out is 0.5**15 / 15! = 2e-17
+    for term in range(13, 0, -1):
+        result = one + scaled @ result / term
+    for _ in range(squarings):
+        result = result @ result
+    return result
 
 
 def edge_weights(blocks: int, edge_share: float) -> np.ndarray:
@@ -297,7 +313,7 @@ def decay(parameters: HindeKalala, sizes: np.ndarray, reference_size: float) -> 
 def retained(parameters, sizes, feed, specific_energy, reference_size) -> np.ndarray:
     """Return the fraction (size,) retained: R(x, E) = R(x, 0) exp(-K(x) E).
 
-    As a population balance: a class between the sieves x_j > x_{j+1} breaks at the rate K(x_j+1), the
+    As a population balance: a class between the sieves x_j > x_{j+1} breaks at the rate K(x_{j+1}), the
     decay of the sieve below it, and of what breaks the share K(x)/K(x_{j+1}) passes the sieve x. With
     rates and fragments so tied ("compensation") the cumulative balance has this exact solution.
     """
@@ -324,12 +340,12 @@ class HindeKalalaFit(NamedTuple):
 def fit_hinde_kalala(tests: Sequence[PilotTest], fixed: Mapping[str, float] | None = None) -> HindeKalalaFit:
     """Fit the Hinde & Kalala model to the measured size distributions of `tests` by least squares.
 
-    The article could not be consulted for its printed equations: this is the model as the present
-    authors read it. What is retained on a sieve decays exponentially with specific energy
-    (`retained`), at a rate that is the sum of two powers of size (`decay`). Two things are
-    additions of this package. The edge, a share of the product, sees `edge_energy` times the mean specific
-    energy, the centre what is left. The specific energy is energy_per_force * specific pressing force,
-    the constant fitted to the specific energies of `tests` by least squares, also where it was measured.
+    The article's printed equations could not be consulted: this is a reading of its approach. What is
+    retained on a sieve decays exponentially with specific energy (`retained`); that the rate is the sum
+    of two powers of size (`decay`) is chosen here. Two things are additions of this package. The edge,
+    a share of the product, sees `edge_energy` times the mean specific energy, the centre what is left.
+    The specific energy is energy_per_force * specific pressing force, its constant fitted to the specific
+    energies of `tests` by least squares, also where one was measured.
 
     Raises
     ------
@@ -398,8 +414,8 @@ _TC_BOUNDS = {
     "fine_exponent": (0.01, 5.0),
     "coarse_exponent": (0.5, 30.0),
     "selection": (1e-7, 1e-1),
-    "slope": (-3.0, 5.0),
-    "curvature": (-3.0, 0.3),
+    "slope": (-2.0, 5.0),
+    "curvature": (-2.0, 0.3),
     "edge_share": (0.01, 0.6),
 }
 _HK_BOUNDS = {
