@@ -219,6 +219,7 @@ class TorresCasaliFit(NamedTuple):
     force: str
     rmse: float  # of the fit, percent passing over all measured curves
     at_bounds: tuple[str, ...]  # fitted parameters that stopped at the end of their range
+    settled: bool  # False if the search ran out of evaluations before it came to rest
 
     def predict(self, test: PilotTest) -> Prediction:
         """Return products, throughput, power and specific energy of `test`.
@@ -273,9 +274,9 @@ def fit_torres_casali(
     def model(parameters: TorresCasali, test: PilotTest) -> Prediction:
         return _torres_casali(parameters, machine, test, reference, blocks, opening, force)
 
-    parameters, error = _least_squares(model, tests, TorresCasali, _TC_BOUNDS, _TC_STARTS, fixed)
+    parameters, error, settled = _least_squares(model, tests, TorresCasali, _TC_BOUNDS, _TC_STARTS, fixed)
     stopped = _at_bounds(parameters, _TC_BOUNDS, fixed)
-    return TorresCasaliFit(parameters, machine, reference, blocks, opening, force, error, stopped)
+    return TorresCasaliFit(parameters, machine, reference, blocks, opening, force, error, stopped, settled)
 
 
 def _torres_casali(parameters, machine, test, reference_size, blocks, opening, force) -> Prediction:
@@ -328,6 +329,7 @@ class HindeKalalaFit(NamedTuple):
     energy_per_force: float  # specific energy / specific pressing force, J kg-1 Pa-1
     rmse: float  # of the fit, percent passing over all measured curves
     at_bounds: tuple[str, ...]  # fitted parameters that stopped at the end of their range
+    settled: bool  # False if the search ran out of evaluations before it came to rest
 
     def predict(self, test: PilotTest) -> Prediction:
         """Return products and specific energy of `test`, from its feed and specific pressing force only.
@@ -366,14 +368,14 @@ def fit_hinde_kalala(tests: Sequence[PilotTest], fixed: Mapping[str, float] | No
     def model(parameters: HindeKalala, test: PilotTest) -> Prediction:
         return _hinde_kalala(parameters, test, reference, constant)
 
-    parameters, error = _least_squares(model, tests, HindeKalala, _HK_BOUNDS, _HK_STARTS, fixed)
+    parameters, error, settled = _least_squares(model, tests, HindeKalala, _HK_BOUNDS, _HK_STARTS, fixed)
     stopped = _at_bounds(parameters, _HK_BOUNDS, fixed)
     powers_free = not {"exponent", "coarse_exponent", "bend"} & fixed.keys()
     if powers_free and parameters.exponent > parameters.coarse_exponent:  # they may come out in either order
         parameters = parameters._replace(
             exponent=parameters.coarse_exponent, coarse_exponent=parameters.exponent, bend=1 - parameters.bend
         )
-    return HindeKalalaFit(parameters, reference, constant, error, stopped)
+    return HindeKalalaFit(parameters, reference, constant, error, stopped, settled)
 
 
 def _hinde_kalala(parameters: HindeKalala, test: PilotTest, reference_size, energy_per_force) -> Prediction:
@@ -426,6 +428,7 @@ _HK_BOUNDS = {
     "edge_share": (0.01, 0.6),
     "edge_energy": (0.01, 1.0),
 }
+_EVALUATIONS = 150  # per start, without those for derivatives; the pilot tests take 10 to 35
 _LOGARITHMIC = {"selection", "rate"}
 # the published porphyry first; the others around it
 _TC_STARTS = (
@@ -442,7 +445,7 @@ _HK_STARTS = (
 
 
 def _least_squares(model: Callable, tests, kind, bounds, starts, fixed) -> tuple:
-    """Return the best parameters over all starts, and their RMSE in percent passing."""
+    """Return the best parameters over all starts, their RMSE in percent passing, and whether it came to rest."""
     free = [name for name in kind._fields if name not in fixed]
 
     def parameters(vector):
@@ -461,15 +464,21 @@ def _least_squares(model: Callable, tests, kind, bounds, starts, fixed) -> tuple
 
     low, high = (coordinates({name: bound[side] for name, bound in bounds.items()}) for side in (0, 1))
     if not free:
-        return kind(**fixed), float(np.sqrt(np.mean(residuals([]) ** 2)))
+        return kind(**fixed), float(np.sqrt(np.mean(residuals([]) ** 2))), True
     fits = [
         optimize.least_squares(
-            residuals, coordinates(start._asdict()), bounds=(low, high), x_scale="jac", xtol=1e-10, ftol=1e-10
+            residuals,
+            coordinates(start._asdict()),
+            bounds=(low, high),
+            x_scale="jac",
+            xtol=1e-10,
+            ftol=1e-10,
+            max_nfev=_EVALUATIONS,
         )
         for start in starts
     ]
     best = min(fits, key=lambda fit: fit.cost)
-    return parameters(best.x), float(np.sqrt(np.mean(best.fun**2)))
+    return parameters(best.x), float(np.sqrt(np.mean(best.fun**2))), best.status > 0
 
 
 def _at_bounds(parameters, bounds, fixed) -> tuple[str, ...]:

@@ -186,7 +186,9 @@ def test_edge_is_taken_from_the_two_ends(blocks, share, weights):
 
 
 def test_predictions_are_distributions_with_the_centre_finest(pilot):
-    fit = baselines.TorresCasaliFit(PLANTED, KHD, 0.0376, 10, "cake_thickness", "specific_pressing_force", math.nan, ())
+    fit = baselines.TorresCasaliFit(
+        PLANTED, KHD, 0.0376, 10, "cake_thickness", "specific_pressing_force", math.nan, (), True
+    )
     for test in pilot:
         found = fit.predict(test)
         for name in baselines.PRODUCTS:
@@ -233,7 +235,7 @@ def test_decay_of_what_is_retained_is_a_population_balance():
 
 
 def test_edge_and_centre_share_the_energy():
-    fit = baselines.HindeKalalaFit(HINDE, 0.032, 0.002, math.nan, ())
+    fit = baselines.HindeKalalaFit(HINDE, 0.032, 0.002, math.nan, (), True)
     found = fit.predict(made_up())
     each = [
         -np.log((1 - passing[:-1]) / (1 - FEED[:-1])) / baselines.decay(HINDE, SIZES, 0.032)[:-1]
@@ -252,16 +254,17 @@ def test_edge_and_centre_share_the_energy():
 def test_torres_casali_recovers_planted_parameters():
     runs = [made_up("A", 0.7, 2e6), made_up("B", 0.5, 4.5e6, cake_thickness=0.021)]
     planted = baselines.TorresCasaliFit(
-        PLANTED, KHD, baselines.coarsest_class(SIZES), 10, "cake_thickness", "hydraulic_pressure", 0.0, ()
+        PLANTED, KHD, baselines.coarsest_class(SIZES), 10, "cake_thickness", "hydraulic_pressure", 0.0, (), True
     )
     fit = baselines.fit_torres_casali([as_measured(run, planted.predict(run)) for run in runs], KHD)
     assert fit.parameters == pytest.approx(PLANTED, rel=1e-3)
     assert fit.rmse < 1e-4
     assert fit.at_bounds == ()
+    assert fit.settled
 
 
 def test_hinde_kalala_recovers_planted_parameters():
-    planted = baselines.HindeKalalaFit(HINDE, 0.032, 0.002, 0.0, ())
+    planted = baselines.HindeKalalaFit(HINDE, 0.032, 0.002, 0.0, (), True)
     runs = [made_up("A", force=force, specific_energy=0.002 * force) for force in (2e6, 5e6)]
     fit = baselines.fit_hinde_kalala([as_measured(run, planted.predict(run)) for run in runs])
     assert fit.parameters == pytest.approx(HINDE, rel=1e-3)
@@ -270,7 +273,7 @@ def test_hinde_kalala_recovers_planted_parameters():
 
 
 def test_energy_per_force_is_fitted_and_power_over_throughput_counts_as_measured():
-    planted = baselines.HindeKalalaFit(HINDE, 0.032, 0.002, 0.0, ())
+    planted = baselines.HindeKalalaFit(HINDE, 0.032, 0.002, 0.0, (), True)
     runs = [
         made_up("A", force=2e6, specific_energy=5000.0),
         made_up("B", force=4e6, power=70e3, throughput=10.0),
@@ -289,6 +292,11 @@ def test_fixed_parameters_stay(pilot):
     fixed = {"edge_share": 0.18, "exponent": 3.0, "coarse_exponent": 0.5}
     fit = baselines.fit_hinde_kalala(pilot[:1], fixed)
     assert fit.parameters._asdict() | fixed == fit.parameters._asdict()
+
+
+def test_searches_that_ran_out_of_evaluations_say_so(pilot, monkeypatch):
+    monkeypatch.setattr(baselines, "_EVALUATIONS", 2)
+    assert not baselines.fit_hinde_kalala(pilot[:1]).settled
 
 
 def test_total_alone_can_be_fitted_with_the_edge_given(pilot):
@@ -330,8 +338,8 @@ def test_predictions_look_at_nothing_that_was_measured_of_the_outcome(pilot):
         specific_throughput=math.nan, specific_energy=math.nan, gap=math.nan,
     )  # fmt: skip
     fits = (
-        baselines.TorresCasaliFit(PLANTED, KHD, 0.04, 3, "cake_thickness", "hydraulic_pressure", 0.0, ()),
-        baselines.HindeKalalaFit(HINDE, 0.045, 0.002, 0.0, ()),
+        baselines.TorresCasaliFit(PLANTED, KHD, 0.04, 3, "cake_thickness", "hydraulic_pressure", 0.0, (), True),
+        baselines.HindeKalalaFit(HINDE, 0.045, 0.002, 0.0, (), True),
     )
     for fit in fits:
         for one, two in zip(fit.predict(bare), fit.predict(pilot[4]), strict=True):
@@ -368,7 +376,7 @@ def test_unmeasured_input_of_the_model_is_refused_naming_the_test():
     said = refused(tests=[bare])
     assert "test K-7, cake_thickness: not measured; the model needs it; measure it or pass opening='gap'" in said
     assert "test K-7, hydraulic_pressure: not measured" in said
-    fit = baselines.TorresCasaliFit(PLANTED, KHD, 0.03, 3, "cake_thickness", "hydraulic_pressure", 0.0, ())
+    fit = baselines.TorresCasaliFit(PLANTED, KHD, 0.03, 3, "cake_thickness", "hydraulic_pressure", 0.0, (), True)
     with pytest.raises(ValueError, match="test K-7, cake_thickness: not measured"):
         fit.predict(bare)
 
