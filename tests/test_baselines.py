@@ -166,10 +166,23 @@ def test_blocks_against_the_matrix_exponential():
     rates = baselines.selection(PLANTED, SIZES, 0.03)
     matrix = baselines.breakage(PLANTED, SIZES) * rates - np.diag(rates)
     feed = -np.diff(FEED[::-1], append=0.0)
-    energies = np.array([3.0, 0.02, 3.0, 40.0]) * KWH_PER_T
+    energies = np.array([3.0, 0.02, 3.0, 5.0]) * KWH_PER_T
     expected = [linalg.expm(energy * matrix) @ feed for energy in energies]
     found = baselines.block_products(PLANTED, SIZES, FEED, energies, 0.03)
-    assert np.abs(found - expected).max() < 1e-12
+    assert np.abs(found - expected).max() < 1e-13
+
+
+def test_a_prediction_spreads_its_power_over_the_blocks():
+    fit = baselines.TorresCasaliFit(PLANTED, KHD, 0.03, 4, "gap", "hydraulic_pressure", math.nan, (), True)
+    run = made_up()
+    flow = 2300 * 0.018 * 0.25 * 0.7
+    watts = 6e6 * 0.4 * 0.25 * 2 * math.sin(baselines.nip_angle(KHD, 0.018) / 2) * 0.7
+    energies = watts * np.array([7, 15, 15, 7]) / 44 / (flow / 4)
+    masses = baselines.block_products(PLANTED, SIZES, FEED, energies, 0.03)
+    found = fit.predict(run)
+    assert (found.throughput, found.power) == pytest.approx((flow, watts))
+    assert found.total == pytest.approx(np.cumsum(masses.mean(axis=0)[::-1]))
+    assert found.edge == pytest.approx(np.cumsum(masses[0, ::-1]))
 
 
 @pytest.mark.parametrize(
@@ -279,9 +292,11 @@ def test_energy_per_force_is_fitted_and_power_over_throughput_counts_as_measured
         made_up("B", force=4e6, power=70e3, throughput=10.0),
         made_up("C", force=3e6),
     ]
-    fit = baselines.fit_hinde_kalala([as_measured(run, planted.predict(run)) for run in runs], fixed=HINDE._asdict())
+    fit = baselines.fit_hinde_kalala(
+        [as_measured(run, planted.predict(run)) for run in runs], fixed=HINDE._asdict() | {"edge_energy": 1.0}
+    )
     assert fit.energy_per_force == pytest.approx((2e6 * 5000 + 4e6 * 7000) / (4e12 + 16e12))
-    assert fit.parameters == HINDE
+    assert fit.parameters == HINDE._replace(edge_energy=1.0)
     assert fit.at_bounds == ()
 
 
