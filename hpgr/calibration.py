@@ -23,6 +23,7 @@ _LOST = 1e3  # percent that a trial is off whose force no gap carries: it is nev
 _CONFIDENCE = 0.95
 _MODULI = ("bulk_modulus", "shear_modulus")
 _CRITICAL = 0.9  # part of the product below the size that the middle of the roll width just breaks, to start from
+_CUSHIONINGS = (1.0, 0.5)  # n to start from; from 1 alone the fit to the KHD tests ends 2 % above its minimum
 _BEDS = 64  # loaded beds kept while fitting
 _UNDETERMINED = 1e-6  # least singular value over the largest below which tests do not tell parameters apart
 
@@ -210,12 +211,13 @@ def fit_tests(scene: Scene, tests: Sequence[PilotTest], fit: Sequence[str], feed
         return function
 
     _refuse_unfit(residuals(True)(start), start, names)
-    place = start
+    place, objective = start, residuals(False)
     if solve.choose(scene) == "march":  # the closed form gives the starting point
         free = [k for k, name in enumerate(names) if name != "n"]
         place = _minimise(residuals(True), place, bounds, free, _STEPS[:1])
-    objective = residuals(False)
-    place = _minimise(objective, place, bounds, range(len(names)), _STEPS)
+    if "n" in names:
+        place = _best_start(objective, place, bounds, names.index("n"))
+    place = _minimise(objective, place, bounds, range(len(names)), _STEPS[-1:] if "n" in names else _STEPS)
     return _calibration(scene, cases, tests, names, place, bounds, objective)
 
 
@@ -317,6 +319,16 @@ def _started(scene: Scene, names: Sequence[str], test: PilotTest, feed: Feed | N
             strength = pressure * (critical / scene.material.strength_size) ** slope
             scene = scene.with_values({"material.strength": min(max(strength, 1e4), 1e9)})
     return scene
+
+
+def _best_start(function, start: np.ndarray, bounds: np.ndarray, cushioning: int) -> np.ndarray:
+    """Return the best of the minima reached from several strengths of cushioning: the valley is shallow and bent."""
+    found = []
+    for value in _CUSHIONINGS:
+        place = start.copy()
+        place[cushioning] = PARAMETERS["n"].scaled(value)
+        found.append(_minimise(function, place, bounds, range(start.size), _STEPS[:1]))
+    return min(found, key=lambda place: float(np.sum(function(place) ** 2)))
 
 
 def _minimise(function, start: np.ndarray, bounds: np.ndarray, free, steps) -> np.ndarray:
