@@ -110,6 +110,7 @@ def _fields(bed: geometry.Geometry, motion: flow.Motion, state: stress.Load) -> 
         "volumetric_strain_rate": motion.volumetric_rate,
         "shear_strain_rate": motion.shear_rate,
         "volumetric_strain": state.volumetric_strain,
+        "shear_strain": state.shear_strain,
         "solid_fraction": state.solid_fraction,
         "pressure": state.pressure,
         "shear_stress": state.shear_stress,

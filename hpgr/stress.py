@@ -21,8 +21,8 @@ class Load(NamedTuple):
 
     Attributes
     ----------
-    volumetric_strain : ndarray
-        Strain since the onset of compaction.
+    volumetric_strain, shear_strain : ndarray
+        Volumetric and elastic triaxial shear strain since the onset of compaction.
     solid_fraction : ndarray
         Solid fraction, at most the material's maximum.
     pressure, shear_stress : ndarray
@@ -36,6 +36,7 @@ class Load(NamedTuple):
     """
 
     volumetric_strain: np.ndarray
+    shear_strain: np.ndarray
     solid_fraction: np.ndarray
     pressure: np.ndarray
     shear_stress: np.ndarray
@@ -88,6 +89,7 @@ def load(scene: Scene, motion: Motion) -> Load:
     shear_stress, _ = _sum_above_zero(d_q)
     return Load(
         volumetric_strain=eps_v,
+        shear_strain=eps_s,
         solid_fraction=phi,
         pressure=pressure,
         shear_stress=shear_stress,
