@@ -260,15 +260,15 @@ class Rolls(_Frozen):
         "Gap where the rolls are closest",
         "machine",
         "measure the working gap, such as '20 mm'",
-        gt=0,
+        ge=1e-6,
         le=1e3,
     )
     entry_gap: Metres = _field(
         "s_t", "m", "Distance between the roll surfaces where the modelled bed begins", "machine",
-        "give the height of the modelled bed as the gap there, such as '100 mm'", gt=0, le=1e3,
+        "give the height of the modelled bed as the gap there, such as '100 mm'", ge=1e-6, le=1e3,
     )  # fmt: skip
     speed: RadiansPerSecond = _field(
-        "omega", "rad s-1", "Roll speed", "machine", "give the roll speed, such as '19 rpm'", gt=0, le=1e6
+        "omega", "rad s-1", "Roll speed", "machine", "give the roll speed, such as '19 rpm'", ge=1e-6, le=1e6
     )
 
     @classmethod
@@ -481,7 +481,7 @@ class Flow(_Frozen):
     )  # fmt: skip
     entry_fraction: Number = _field(
         "y_0/H", "1", "Depth of the first material point as a fraction of the bed's height (v = 0 at depth 0)",
-        "ours", "give a fraction such as 0.02", 0.02, gt=0, lt=1,
+        "ours", "give a fraction such as 0.02", 0.02, ge=1e-9, lt=1,
     )  # fmt: skip
 
 
