@@ -180,7 +180,9 @@ def _notes(scene: Scene, bed: geometry.Geometry, state: stress.Load, crushed: so
             "single grains, which is not modelled"
         )
     if state.tension_clamped:
-        notes["tension_clamped"] = "the elastic law asked for tension; the pressure was held at 0 there"
+        notes["tension_clamped"] = "the elastic law asked for tension or reverse shear; stresses were held at 0 there"
+        if ore.elastic_exponent < 0:
+            notes["tension_clamped"] += ", and with elastic_exponent below 0 need not converge as time steps shrink"
     if crushed is None:
         return notes
     if not crushed.breaks.any():

@@ -32,7 +32,7 @@ class Load(NamedTuple):
     continuity_solid_fraction : ndarray
         (streamline,) solid fraction that mass continuity would need at the exit; may exceed 1.
     tension_clamped : bool
-        Whether the law asked for tension somewhere and got zero pressure.
+        Whether the law asked for tension, or for shear against the flow, somewhere: stresses are held at 0 then.
     """
 
     volumetric_strain: np.ndarray
@@ -86,7 +86,7 @@ def load(scene: Scene, motion: Motion) -> Load:
     else:
         d_p, d_q = _euler_increments(material, motion, compacting, eps_v, eps_s, phi)
     pressure, tension = _sum_above_zero(d_p)
-    shear_stress, _ = _sum_above_zero(d_q)
+    shear_stress, reversal = _sum_above_zero(d_q)
     return Load(
         volumetric_strain=eps_v,
         shear_strain=eps_s,
@@ -95,7 +95,12 @@ def load(scene: Scene, motion: Motion) -> Load:
         shear_stress=shear_stress,
         on_shear_limit=limited,
         continuity_solid_fraction=material.feed_solid_fraction * np.exp(eps_v[:, -1]),
-        tension_clamped=bool(tension > _TENSION_NOISE * pressure.max(initial=0.0)),
+        tension_clamped=(
+            tension > _TENSION_NOISE * pressure.max(initial=0.0)
+            or reversal > _TENSION_NOISE * shear_stress.max(initial=0.0)
+            # explicit steps from zero strain miss what the state functions say there; they do so for c < 0 only
+            or bool((state_pressure(eps_v, eps_s, material) < 0).any())
+        ),
     )
 
 
