@@ -20,8 +20,7 @@ from studies.plots.bed import draw_cells, draw_rolls
 
 _POSITIONS = 5  # of the stream tubes, at most, whose product is drawn
 _DASHES = ("-", (0, (6, 1.5)), (0, (3, 1.2)), (0, (4, 1, 1, 1)), (0, (1, 1)))
-_FRAME = 90  # ms that a frame is shown
-_LAST = 2500  # ms that the last frame is
+_SLOW, _FIRST, _FRAME, _LAST = 10, 400, 60, 2500  # the first frames, and ms that they, others and the last are shown
 _COLOURS = 128  # of the animation
 
 
@@ -59,8 +58,7 @@ def figure4(result: xr.Dataset) -> Figure:
     for panel, (name, title) in zip(panels[:2], fields.items(), strict=True):
         _rolls(panel, result)
         drawn = _field(panel, result, 1e-6 * result[name], maps.lipari_r, "{:g}")
-        panel.contour(1e3 * result["x"].values, 1e3 * result["height"].values, result["volumetric_strain_rate"].values,
-                      levels=[0], colors="0.25", linewidths=1.2, linestyles="--")  # fmt: skip
+        _compacting(panel, result)
         figure.colorbar(drawn, ax=panel, label=f"{title[4:]} [MPa]", shrink=0.85)
         panel.set_title(title)
     _along_mid_gap(panels[2], result)
@@ -106,7 +104,9 @@ def _distributions(panel, result: xr.Dataset) -> None:
     enlarged.tick_params(labelsize=8)
     for axes in (panel, enlarged):
         axes.grid(color="0.9", which="both")
-    panel.indicate_inset_zoom(enlarged, edgecolor="0.4")
+    for connector in panel.indicate_inset_zoom(enlarged, edgecolor="0.4").connectors:
+        connector.set_visible(False)  # they would cross the legend
+    enlarged.set_title("enlarged", fontsize=9, pad=3)
 
 
 def _sizes_across(panel, result: xr.Dataset) -> None:
@@ -150,16 +150,17 @@ def startup_animation(result: xr.Dataset, path: Path) -> None:
         images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB"))
     palette = images[len(images) // 2].quantize(_COLOURS)  # one for all: frames then differ only where the bed does
     indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    shown = [_FRAME] * (len(indexed) - 1) + [_LAST]
+    shown = [_FIRST if k < _SLOW else _FRAME for k in range(len(indexed) - 1)] + [_LAST]
     indexed[0].save(path, format="GIF", save_all=True, append_images=indexed[1:], duration=shown, loop=0)
 
 
 def _startup_words(result: xr.Dataset) -> str:
     exchange = Scene.model_validate_json(result.attrs["scene"]).exchange
     how = "without exchange" if exchange is None else f"A = {exchange.segregation:g}, B = {exchange.mixing:g}"
+    step = 1e3 * float(result["shown_time_step"])
     return (
-        f"Filled with feed, then turning for one residence time; {how}.\n"
-        "The first frame is after the first time step of crushing."
+        f"Filled with feed, then turning for one residence time; {how}. Grains break once per time\n"
+        f"step of {step:.3g} ms at most, which paces the first frames; the first of them shows one such step."
     )
 
 
@@ -204,6 +205,13 @@ def _round_step(step: float) -> float:
     """Return the largest of 1, 2, 5 times a power of ten below `step`."""
     power = 10.0 ** np.floor(np.log10(step))
     return float(power * max(m for m in (1, 2, 5) if m * power <= step * (1 + 1e-9)))
+
+
+def _compacting(panel, result: xr.Dataset) -> None:
+    """Mark where compaction begins and ends."""
+    place = (1e3 * result["x"].values, 1e3 * result["height"].values, result["volumetric_strain_rate"].values)
+    for style in ({"colors": "white", "linewidths": 2.4}, {"colors": "0.15", "linewidths": 1.2, "linestyles": "--"}):
+        panel.contour(*place, levels=[0], **style)
 
 
 def _along_mid_gap(panel, result: xr.Dataset) -> None:
@@ -264,7 +272,7 @@ def _caption(figure: Figure, result: xr.Dataset, words: str, limits: bool = Fals
     exchange = "without exchange" if scene.exchange is None else "with segregation and mixing"
     about = (
         f"Rolls {units.show(rolls.diameter, 'm')}, gap {units.show(rolls.gap, 'm')}, entry gap "
-        f"{units.show(rolls.entry_gap, 'm')}, {units.show(rolls.speed, 'rad s-1')}; {scene.feed.kind} feed to "
+        f"{units.show(rolls.entry_gap, 'm')}, {30 / np.pi * rolls.speed:.3g} rpm; {scene.feed.kind} feed to "
         f"{units.show(scene.feed.coarsest, 'm')}; {exchange}."
     )
     hit = [line.partition(": ")[2] for line in result.attrs["notes"].splitlines()] if limits else []

@@ -1,0 +1,132 @@
+"""NetCDF files against the CF-1.11 compliance checker, where it is installed: pip install '.[cf]'."""
+
+import json
+import subprocess
+import sys
+from importlib.util import find_spec
+
+import netCDF4
+import numpy as np
+import pytest
+import xarray as xr
+from support import paper
+from test_accuracy import TINY
+
+import hpgr
+from studies import accuracy, store
+from studies import paper as figures
+from studies.sweep import sweep
+
+CHECKER = find_spec("compliance_checker") is not None
+NO_CHECKER = "the compliance checker is not installed (pip install '.[cf]')"
+# the checker subtracts the values of every coordinate, and gives this check up where they are text
+TEXT = "check_coordinate_variables_strict_monotonicity: unsupported operand type(s) for -: 'str' and 'str'"
+
+
+def datasets():
+    small = {"resolution.streamlines": 2, "resolution.points": 21, "resolution.cells": 30}
+    exchange = {"resolution.record": "distributions", "resolution.photographs": 2, "exchange.record_startup": True}
+    return {
+        "cells": hpgr.simulate(paper(small)),
+        "distributions": hpgr.simulate(paper(small | exchange)),
+        "stress": hpgr.simulate(paper(small | {"resolution.cells": 0})),
+        "tolerance": hpgr.simulate(
+            paper({"resolution.record": "product", "material.cushioning": np.inf}), tolerance=0.1
+        ),
+        "gap_sweep": sweep(paper(small), {"rolls.gap": [0.04, 0.06, 1.2], "feed.top_size": [0.05, 0.06]}, replicates=2),
+        "text_axis": sweep(paper(small), {"stress.integrator": ["euler", "increment"]}),
+        "paper": figures.study(paper(small), 8),
+        "accuracy": accuracy.study(paper(), TINY),
+    }
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Every kind of file that is written, and one that should fail."""
+    folder = tmp_path_factory.mktemp("files")
+    for name, dataset in datasets().items():
+        store.write_dataset(dataset, folder / f"{name}.nc")
+    raw = hpgr.simulate(paper({"resolution.points": 11}))
+    raw.to_netcdf(folder / "raw.nc", engine="netcdf4")  # with its time, which is none to the conventions
+    return folder
+
+
+@pytest.fixture(scope="module")
+def checked(folder):
+    """Return what the checker reports on every file, by its name, and what it says on standard error."""
+    if not CHECKER:
+        pytest.skip(NO_CHECKER)
+    names = sorted(folder.glob("*.nc"))
+    command = "import sys; from cchecker import main; sys.exit(main())"
+    options = ["-t", "cf:1.11", "-c", "strict", "-f", "json_new", "-o", str(folder / "report.json")]
+    done = subprocess.run(
+        [sys.executable, "-c", command, *options, *map(str, names)], capture_output=True, text=True, timeout=300
+    )
+    report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    assert len(report) == len(names)
+    return {path.stem: report[str(path)]["cf:1.11"] for path in names}, done.stderr
+
+
+def complaints(report):
+    """Every message of the report: errors, warnings and suggestions."""
+    return [
+        message
+        for result in report["all_priorities"]
+        if result["value"][0] < result["value"][1]
+        for message in result["msgs"]
+    ]
+
+
+NAMES = ("cells", "distributions", "stress", "tolerance", "gap_sweep", "text_axis", "paper", "accuracy")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_checker_has_nothing_to_say(checked, name):
+    reports, _ = checked
+    assert complaints(reports[name]) == []
+    assert reports[name]["scored_points"] == reports[name]["possible_points"] > 50
+
+
+def test_checker_sees_what_is_wrong(checked):
+    reports, _ = checked
+    assert any("'time' should have standard_name" in message for message in complaints(reports["raw"]))
+
+
+def test_checker_gives_up_on_text_only(checked):
+    _, said = checked
+    failures = [line for line in said.splitlines() if line.startswith("cf:1.11.")]
+    assert failures == [f"cf:1.11.{TEXT}"] * 2  # text_axis and accuracy
+
+
+def test_numbers_along_dimensions_are_in_order(folder):
+    """The check that the checker gives up, of the coordinates that are numbers."""
+    seen = 0
+    for path in folder.glob("*.nc"):
+        with netCDF4.Dataset(path) as file:
+            for name in set(file.dimensions) & set(file.variables):
+                if file[name].dtype is not str:
+                    assert (np.diff(file[name][:]) > 0).all(), (path, name)
+                    seen += 1
+    assert seen > 10
+
+
+def test_files_call_photographs_so(folder):
+    original = hpgr.simulate(paper({"resolution.streamlines": 2, "resolution.points": 21, "resolution.cells": 30}))
+    with xr.open_dataset(folder / "cells.nc") as opened:
+        opened.load()
+    assert "time" not in opened.variables
+    xr.testing.assert_identical(opened["size"].rename(photograph="time").variable, original["size"].variable)
+    # metrics take a file as it is
+    for point in (-1, 12):
+        found = hpgr.passing(opened, [0.001, 0.02], point=point)
+        xr.testing.assert_identical(found, hpgr.passing(original, [0.001, 0.02], point=point))
+    assert float(hpgr.percentile_size(opened, 30, total=True)) == float(hpgr.percentile_size(original, 30, total=True))
+
+
+def test_metrics_leave_the_startup_of_a_file_out(folder):
+    with xr.open_dataset(folder / "distributions.nc") as opened:
+        opened.load()
+    assert opened["steady"].values.tolist() == [0, 1, 1]
+    found = hpgr.passing(opened, point=15).transpose("streamline", "sieve")
+    exact = opened["mass_fraction"].values[1:, :, 15].astype(float).mean(axis=0).cumsum(axis=-1)
+    np.testing.assert_allclose(found.values, exact, rtol=1e-5)
