@@ -331,6 +331,7 @@ def _attributes(scene: Scene, shown_points: int, seed: int) -> dict[str, Any]:
         "Conventions": "CF-1.11",
         "title": "Figures 3, 4 and 5 of 'Heterarchical model of comminution in high pressure grinding rolls'",
         "source": f"hpgr {hpgr.__version__}",
+        "history": f"hpgr {hpgr.__version__}: studies.paper.study(scene, {shown_points}, seed={seed})",
         "scene": scene.model_dump_json(),
         "shown_points": shown_points,
         "seed": seed,

@@ -21,6 +21,14 @@ CHECKER = find_spec("compliance_checker") is not None
 NO_CHECKER = "the compliance checker is not installed (pip install '.[cf]')"
 # the checker subtracts the values of every coordinate, and gives this check up where they are text
 TEXT = "check_coordinate_variables_strict_monotonicity: unsupported operand type(s) for -: 'str' and 'str'"
+RUN = """
+import sys
+from compliance_checker.runner import CheckSuite, ComplianceChecker
+
+report, *files = sys.argv[1:]
+CheckSuite.load_all_available_checkers()
+ComplianceChecker.run_checker(files, ["cf:1.11"], 0, "strict", output_format="json_new", output_filename=report)
+"""
 
 
 def datasets():
@@ -45,6 +53,7 @@ def folder(tmp_path_factory):
     """Every kind of file that is written, and one that should fail."""
     folder = tmp_path_factory.mktemp("files")
     for name, dataset in datasets().items():
+        dataset.attrs.setdefault("history", "as the commands write it")
         store.write_dataset(dataset, folder / f"{name}.nc")
     raw = hpgr.simulate(paper({"resolution.points": 11}))
     raw.to_netcdf(folder / "raw.nc", engine="netcdf4")  # with its time, which is none to the conventions
@@ -57,11 +66,8 @@ def checked(folder):
     if not CHECKER:
         pytest.skip(NO_CHECKER)
     names = sorted(folder.glob("*.nc"))
-    command = "import sys; from cchecker import main; sys.exit(main())"
-    options = ["-t", "cf:1.11", "-c", "strict", "-f", "json_new", "-o", str(folder / "report.json")]
-    done = subprocess.run(
-        [sys.executable, "-c", command, *options, *map(str, names)], capture_output=True, text=True, timeout=300
-    )
+    told = [str(folder / "report.json"), *map(str, names)]
+    done = subprocess.run([sys.executable, "-c", RUN, *told], capture_output=True, text=True, timeout=300)
     report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     assert len(report) == len(names)
     return {path.stem: report[str(path)]["cf:1.11"] for path in names}, done.stderr
@@ -118,8 +124,8 @@ def test_files_call_photographs_so(folder):
     xr.testing.assert_identical(opened["size"].rename(photograph="time").variable, original["size"].variable)
     # metrics take a file as it is
     for point in (-1, 12):
-        found = hpgr.passing(opened, [0.001, 0.02], point=point)
-        xr.testing.assert_identical(found, hpgr.passing(original, [0.001, 0.02], point=point))
+        found, exact = (hpgr.passing(one, [0.001, 0.02], point=point) for one in (opened, original))
+        xr.testing.assert_identical(found.variable, exact.variable)
     assert float(hpgr.percentile_size(opened, 30, total=True)) == float(hpgr.percentile_size(original, 30, total=True))
 
 
