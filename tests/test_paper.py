@@ -14,7 +14,7 @@ from studies import paper as study
 from studies import store
 
 SMALL = {"resolution.streamlines": 4, "resolution.points": sized(81, 41), "resolution.cells": sized(400, 100)}
-SHOWN = sized(24, 12)
+SHOWN = 24
 CHANCE = 1e-6  # of a false alarm, in every sampled comparison here
 
 
