@@ -23,6 +23,8 @@ MOST_NUMBERS = 4_000_000  # in a page: about 30 MB, which a browser still opens 
 DIGITS, SPREAD_DIGITS = 6, 4  # significant digits of means (float32 has about 7) and of standard deviations
 
 _CASE = ("operating_point", "replicate")
+_MADE = ("history", "source", "seed", "versions")  # attributes that tell how the sweep was made
+_MOST_LOST = 10  # lost operating points that the page lists; the others tell when they are selected
 
 
 def page_data(result: xr.Dataset, sieve: float, name: str) -> dict[str, Any]:
@@ -63,8 +65,8 @@ def page_data(result: xr.Dataset, sieve: float, name: str) -> dict[str, Any]:
     held = (points["status"] == STATUS["ok"]).sum("replicate").values
     return {
         "name": name,
-        "told": [line[0].upper() + line[1:] for line in report.notes(result)],
-        "made": {key: str(result.attrs[key]) for key in ("history", "source", "seed", "versions") if key in result.attrs},
+        "told": [line[0].upper() + line[1:] for line in told(result)],
+        "made": {key: str(result.attrs[key]) for key in _MADE if key in result.attrs},
         "replicates": result.sizes["replicate"],
         "axes": [axis_data(result[axis], scene) for axis in axes],
         "start": start(result, scene, held),
@@ -80,6 +82,13 @@ def page_data(result: xr.Dataset, sieve: float, name: str) -> dict[str, Any]:
         "feed_of": feed_of,
         "scene": json.loads(result.attrs["scene"]),
     }  # fmt: skip
+
+
+def told(result: xr.Dataset) -> list[str]:
+    """Return what a page says of the whole sweep: notes, limits, lost cases."""
+    lost = report.lost_cases(result)
+    more = [f"and {len(lost) - _MOST_LOST} more lost operating points"] if len(lost) > _MOST_LOST else []
+    return report.notes(result) + lost[:_MOST_LOST] + more
 
 
 def require_sweep(result: xr.Dataset, name: str) -> None:
@@ -106,9 +115,9 @@ def refuse_too_many(result: xr.Dataset, sieves: xr.DataArray | None, name: str) 
     if 2 * points * each > MOST_NUMBERS:
         axis = max(report.axes_of(result), key=lambda one: result.sizes[one])
         raise ValueError(
-            f"{name}: its {points} operating points of {each} figures, each with its spread, are {2 * points * each:.2g} "
-            f"numbers; a page holds at most {MOST_NUMBERS:.2g}, {MOST_NUMBERS // (2 * each)} such points; show a part: "
-            f'xarray.open_dataset("{name}").isel({axis}=slice(None, None, 2)).to_netcdf("part.nc")'
+            f"{name}: {points} operating points of {each} means and spreads are {2 * points * each:.2g} numbers; "
+            f"a page holds at most {MOST_NUMBERS:.2g}, here {MOST_NUMBERS // (2 * each)} operating points; "
+            f'show a part: xarray.open_dataset("{name}").isel({axis}=slice(None, None, 2)).to_netcdf("part.nc")'
         )
 
 
@@ -149,9 +158,8 @@ def _short(value: float, digits: int) -> float | int | None:
 def kpis(points: xr.Dataset, sieve: float) -> list[dict[str, Any]]:
     """Return every figure of an operating point but the percent below a sieve, which the page takes from `passing`."""
     ok = points["status"] == STATUS["ok"]
-    known = {
-        heading: (values.where(ok), "") for heading, values in report.figures(points, sieve).items() if not heading.startswith("below ")
-    }  # fmt: skip
+    first = report.figures(points, sieve)
+    known = {heading: (values.where(ok), "") for heading, values in first.items() if not heading.startswith("below ")}
     for name in of_dims(points, set(_CASE)):
         if name not in ("status", "flags", *report.READ):
             known[heading_of(points[name])] = (shown(points, name), points[name].attrs.get("long_name", ""))
@@ -277,13 +285,15 @@ def _nearest(axis: xr.DataArray, scene: Scene) -> int:
 def feeds_of(result: xr.Dataset, scene: Scene) -> tuple[list[Feed | None], list[int]]:
     """Return every feed of the sweep, None where a scene is refused, and the number of each operating point's feed."""
     axes = report.axes_of(result)
-    swept = [name for name in axes if result[name].attrs["scene_field"].startswith("feed.")]
+    fields = {name: result[name].attrs["scene_field"] for name in axes}
+    swept = [name for name in axes if fields[name].startswith("feed.")]
     every = list(itertools.product(*(range(result.sizes[name]) for name in swept)))
-    fields = [{result[name].attrs["scene_field"]: result[name].values[k].item() for name, k in zip(swept, place, strict=True)}
-              for place in every]  # fmt: skip
+    values = [
+        {fields[name]: result[name].values[k].item() for name, k in zip(swept, place, strict=True)} for place in every
+    ]
     places = itertools.product(*(range(result.sizes[name]) for name in axes))
     chosen = [tuple(k for name, k in zip(axes, place, strict=True) if name in swept) for place in places]
-    return [_feed(scene, values) for values in fields], [every.index(place) for place in chosen]
+    return [_feed(scene, each) for each in values], [every.index(place) for place in chosen]
 
 
 def _feed(scene: Scene, values: dict[str, Any]) -> Feed | None:
