@@ -30,12 +30,12 @@ def percent_passing(result: xr.Dataset, sieve: float, total: bool = True) -> xr.
     return found
 
 
-_READ = ("throughput", "p50_total", "p80_total", "passing_total", "peak_pressure")
+READ = ("throughput", "p50_total", "p80_total", "passing_total", "peak_pressure")
 
 
 def figures(result: xr.Dataset, sieve: float) -> dict[str, xr.DataArray]:
     """Return the figures a study is read by, by heading, in the units people use."""
-    result = result[[name for name in _READ if name in result]].astype(float)
+    result = result[[name for name in READ if name in result]].astype(float)
     found = {"throughput [t/h]": result["throughput"] * 3.6}
     if "p80_total" in result:
         found["P50 [mm]"] = result["p50_total"] * 1e3
