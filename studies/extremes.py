@@ -22,7 +22,7 @@ from pydantic import ValidationError
 
 from hpgr import budget, presets
 from hpgr.keys import refuse_key
-from hpgr.scene import Scene, faults_of
+from hpgr.scene import Scene
 from studies import ranges
 from studies.command import refusing, shown_as
 
