@@ -109,7 +109,7 @@ def nip_angle(scene: Scene) -> float:
     --------
     >>> import hpgr
     >>> round(nip_angle(hpgr.presets.industrial()), 3)
-    0.151
+    0.149
     """
     if scene.flow.nip_angle is not None:
         return scene.flow.nip_angle

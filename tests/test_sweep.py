@@ -133,18 +133,19 @@ def test_seed_decides_the_bits(base, client):
     assert not np.array_equal(one["passing"], other["passing"])
 
 
-def test_speed_changes_throughput_only(base, client):
+def test_speed_changes_throughput_and_power_only(base, client):
     speed = 19 * np.pi / 30
     result = sweep(base, {"rolls.speed": [speed, 2 * speed, 4 * speed, 1.37 * speed]}, 2, client=client)
     for name in result.data_vars:
-        if name not in ("throughput", "message"):
+        if name not in ("throughput", "power", "message"):
             first = result[name].isel(roll_speed=0)
             changed = [k for k in range(4) if not np.array_equal(result[name].isel(roll_speed=k), first)]
             assert not changed, name
-    flow = result["throughput"].values
-    assert np.array_equal(flow[1], 2 * flow[0])  # doubling is exact in binary
-    assert np.array_equal(flow[2], 4 * flow[0])
-    assert flow[3] == pytest.approx(1.37 * flow[0], rel=2**-23)  # one rounding of float32
+    for name in ("throughput", "power"):  # in proportion to speed, by energy and mass per roll turn
+        flow = result[name].values
+        assert np.array_equal(flow[1], 2 * flow[0])  # doubling is exact in binary
+        assert np.array_equal(flow[2], 4 * flow[0])
+        assert flow[3] == pytest.approx(1.37 * flow[0], rel=2**-23)  # one rounding of float32
 
 
 def test_other_fields_as_axes(base, client):
