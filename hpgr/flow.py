@@ -108,8 +108,9 @@ def nip_angle(scene: Scene) -> float:
     Examples
     --------
     >>> import hpgr
-    >>> round(nip_angle(hpgr.presets.industrial()), 3)
-    0.149
+    >>> cake = {"flow.nip_angle": None, "flow.cake_solid_fraction": 0.84}
+    >>> round(nip_angle(hpgr.presets.khd_pilot().with_values(cake)), 3)
+    0.16
     """
     if scene.flow.nip_angle is not None:
         return scene.flow.nip_angle

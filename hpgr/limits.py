@@ -38,7 +38,7 @@ def crushed_passing(feed: Feed, size, critical, gamma: float) -> np.ndarray:
         Fragment exponent.
     """
     size, critical = np.broadcast_arrays(np.asarray(size, dtype=float), np.asarray(critical, dtype=float))
-    crushed = (1 - feeds.passing(feed, critical)) * (size / critical) ** gamma  # 0 where s_c is inf
+    crushed = (1 - feeds.passing(feed, critical)) * np.minimum(size / critical, 1.0) ** gamma  # 0 where s_c is inf
     return np.where(size < critical, feeds.passing(feed, size) + crushed, 1.0)
 
 

@@ -117,6 +117,7 @@ def _fields(bed: geometry.Geometry, motion: flow.Motion, state: stress.Load) -> 
         "volumetric_strain_rate": motion.volumetric_rate,
         "shear_strain_rate": motion.shear_rate,
         "volumetric_strain": state.volumetric_strain,
+        "shear_strain": state.shear_strain,
         "solid_fraction": state.solid_fraction,
         "pressure": state.pressure,
         "shear_stress": state.shear_stress,
@@ -210,7 +211,9 @@ def _notes(scene: Scene, prepared: Prepared, crushed: solve.Crushed | None) -> d
             "single grains, which is not modelled"
         )
     if state.tension_clamped:
-        notes["tension_clamped"] = "the elastic law asked for tension; the pressure was held at 0 there"
+        notes["tension_clamped"] = "the elastic law asked for tension or reverse shear; stresses were held at 0 there"
+        if ore.elastic_exponent < 0:
+            notes["tension_clamped"] += ", and with elastic_exponent below 0 need not converge as time steps shrink"
     _, felt = _felt(scene, prepared)
     unusual = machine.unusual(scene, felt, float(state.solid_fraction[:, -1].mean()))
     if unusual:

@@ -12,7 +12,7 @@ import numbers
 import operator
 import tomllib
 from collections.abc import Iterator, Mapping
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self, get_args
 
@@ -151,17 +151,22 @@ class _Frozen(BaseModel):
                     known |= {f"{name}.{key}": value for key, value in part._known_values(raw).items()}
                 continue
             try:
-                known[name] = _valid_alone(field, raw)
+                known[name] = _valid_alone(cls, name, raw)
             except ValidationError:
                 continue
         return known
 
 
-def _valid_alone(field: Any, value: Any) -> Any:
-    """Return `value` validated against one model field."""
-    strictness = ConfigDict(allow_inf_nan=False)
-    carrier = create_model("Alone", __config__=strictness, value=(field.annotation, field))
-    return carrier.model_validate({"value": value}).value
+def _valid_alone(part: type["_Frozen"], name: str, value: Any) -> Any:
+    """Return `value` validated against one field of a model."""
+    return _carrier(part, name).model_validate({"value": value}).value
+
+
+@cache
+def _carrier(part: type["_Frozen"], name: str) -> type[BaseModel]:
+    """Return a model of one field alone; made once, for making one takes a millisecond."""
+    field = part.model_fields[name]
+    return create_model("Alone", __config__=ConfigDict(allow_inf_nan=False), value=(field.annotation, field))
 
 
 def _part(field: Any) -> type["_Frozen"] | None:
@@ -262,15 +267,15 @@ class Rolls(_Frozen):
         "Gap where the rolls are closest",
         "machine",
         "measure the working gap, such as '20 mm'",
-        gt=0,
+        ge=1e-6,
         le=1e3,
     )
     entry_gap: Metres = _field(
         "s_t", "m", "Distance between the roll surfaces where the modelled bed begins", "machine",
-        "give the height of the modelled bed as the gap there, such as '100 mm'", gt=0, le=1e3,
+        "give the height of the modelled bed as the gap there, such as '100 mm'", ge=1e-6, le=1e3,
     )  # fmt: skip
     speed: RadiansPerSecond = _field(
-        "omega", "rad s-1", "Roll speed", "machine", "give the roll speed, such as '19 rpm'", gt=0, le=1e6
+        "omega", "rad s-1", "Roll speed", "machine", "give the roll speed, such as '19 rpm'", ge=1e-6, le=1e6
     )
     specific_pressing_force: Pascals | None = _field(
         "F_sp", "Pa", "Pressing force over D L, held by the machine while the gap floats; the gap given is then only "
@@ -494,7 +499,7 @@ class Flow(_Frozen):
     )  # fmt: skip
     entry_fraction: Number = _field(
         "y_0/H", "1", "Depth of the first material point as a fraction of the bed's height (v = 0 at depth 0)",
-        "ours", "give a fraction such as 0.02", 0.02, gt=0, lt=1,
+        "ours", "give a fraction such as 0.02", 0.02, ge=1e-9, lt=1,
     )  # fmt: skip
     nip_angle: Radians | None = _field(
         "alpha", "rad", "Nip angle of profile 'nip': where the rolls grip the bed", "machine and ore",
@@ -862,9 +867,9 @@ def field_value(name: str, value: Any) -> Any:
     ValueError
         If a scene has no such field, or the field refuses the value.
     """
-    part, field = _find_field(name)
+    part, _ = _find_field(name)
     try:
-        return _valid_alone(field, value)
+        return _valid_alone(part, name.rpartition(".")[2], value)
     except ValidationError as error:
         fault = error.errors(include_url=False)[0] | {"loc": (name.rpartition(".")[2],)}
         raise ValueError(f"{name}: {_explained(part, fault)['type'].message()}") from None

@@ -42,6 +42,7 @@ VARIABLES = {
     "volumetric_strain_rate": Variable(_POINT, "s-1", "volumetric strain rate, compaction positive"),
     "shear_strain_rate": Variable(_POINT, "s-1", "triaxial shear strain rate"),
     "volumetric_strain": Variable(_POINT, "1", "volumetric strain since the onset of compaction"),
+    "shear_strain": Variable(_POINT, "1", "elastic triaxial shear strain since the onset of compaction"),
     "solid_fraction": Variable(_POINT, "1", "solid fraction"),
     "pressure": Variable(_POINT, "Pa", "mean stress p, compression positive"),
     "shear_stress": Variable(_POINT, "Pa", "triaxial shear stress q"),

@@ -21,8 +21,8 @@ class Load(NamedTuple):
 
     Attributes
     ----------
-    volumetric_strain : ndarray
-        Strain since the onset of compaction.
+    volumetric_strain, shear_strain : ndarray
+        Volumetric and elastic triaxial shear strain since the onset of compaction.
     solid_fraction : ndarray
         Solid fraction, at most the material's maximum.
     pressure, shear_stress : ndarray
@@ -32,10 +32,11 @@ class Load(NamedTuple):
     continuity_solid_fraction : ndarray
         (streamline,) solid fraction that mass continuity would need at the exit; may exceed 1.
     tension_clamped : bool
-        Whether the law asked for tension somewhere and got zero pressure.
+        Whether the law asked for tension, or for shear against the flow, somewhere: stresses are held at 0 then.
     """
 
     volumetric_strain: np.ndarray
+    shear_strain: np.ndarray
     solid_fraction: np.ndarray
     pressure: np.ndarray
     shear_stress: np.ndarray
@@ -84,15 +85,21 @@ def load(scene: Scene, motion: Motion) -> Load:
     else:
         d_p, d_q = _euler_increments(material, motion, compacting, eps_v, eps_s, phi)
     pressure, tension = _sum_above_zero(d_p)
-    shear_stress, _ = _sum_above_zero(d_q)
+    shear_stress, reversal = _sum_above_zero(d_q)
     return Load(
         volumetric_strain=eps_v,
+        shear_strain=eps_s,
         solid_fraction=phi,
         pressure=pressure,
         shear_stress=shear_stress,
         on_shear_limit=limited,
         continuity_solid_fraction=material.feed_solid_fraction * np.exp(eps_v[:, -1]),
-        tension_clamped=bool(tension > _TENSION_NOISE * pressure.max(initial=0.0)),
+        tension_clamped=(
+            tension > _TENSION_NOISE * pressure.max(initial=0.0)
+            or reversal > _TENSION_NOISE * shear_stress.max(initial=0.0)
+            # explicit steps from zero strain miss what the state functions say there; they do so for c < 0 only
+            or bool((state_pressure(eps_v, eps_s, material) < 0).any())
+        ),
     )
 
 

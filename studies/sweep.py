@@ -311,7 +311,7 @@ def _assemble(base, grid, replicates, seed, outcomes) -> "xr.Dataset":
         info = field_info(name)
         attrs = {"units": info.unit, "long_name": info.text, "scene_field": name}
         dataset.coords[dim_of(name)] = (dim_of(name), np.array(values), attrs if info.unit else {})
-    attrs = {"units": "1", "long_name": "independent repetition"}
+    attrs = {"units": "1", "long_name": "independent repetition", "standard_name": "realization"}
     dataset.coords["replicate"] = ("replicate", np.arange(replicates, dtype=np.int32), attrs)
     for name, (own_dims, stack) in stacks.items():
         if name in uneven:

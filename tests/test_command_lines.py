@@ -308,7 +308,7 @@ def test_feed_of_one_size_has_no_top_size(run, folder):
         (["--gap", "40"], ["gap", "'40'", "without a unit", "40 mm"]),
         (["--gap", "40 parsnips"], ["gap", "40 parsnips"]),
         (["--gap", "40 kg"], ["gap", "40 kg", "mm"]),
-        (["--gap", "-40 mm"], ["gap", "-40 mm", "greater than 0"]),
+        (["--gap", "-40 mm"], ["gap", "-40 mm", "at least 0.001 mm"]),
         (["--gap", "40 mm", "4 cm"], ["gap", "0.04", "twice"]),
         (["--roll-speed", "3 m"], ["speed", "3 m", "rpm"]),
         (["--feed-top-size", "nan mm"], ["top_size", "NaN"]),

@@ -283,9 +283,14 @@ def test_two_or_three_cells_are_flagged(cells, flagged):
     assert ("few_cells" in flags(simulate(paper({"resolution.cells": cells})))) is flagged
 
 
+def test_cushioning_too_weak_to_square_is_none():
+    assert same_bits(*(simulate(paper({"material.cushioning": n})) for n in (1e300, INF)))
+
+
 def test_tension_is_flagged():
     ds = simulate(paper({"resolution.cells": 0, "material.elastic_exponent": -0.5}))
     assert "tension_clamped" in flags(ds)
+    assert "need not converge" in ds.attrs["notes"]
     assert np.all(ds["pressure"] >= 0)
 
 

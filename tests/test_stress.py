@@ -285,6 +285,25 @@ def test_negative_exponents_that_ask_for_tension_are_told():
     assert not stress.load(constant_phi(), motion(np.full(11, 0.01), np.full(11, 1.0), 0.1)).tension_clamped
 
 
+@pytest.mark.parametrize("c", [-0.5, -0.99])
+@pytest.mark.parametrize("integrator", ["increment", "euler"])
+def test_negative_exponents_are_told_by_both_integrators(integrator, c):
+    """At the onset shear outweighs compaction, and the law asks for tension; the explicit rule steps over it."""
+    scene = paper({"material.elastic_exponent": c, "stress.integrator": integrator})
+    strained = motion(np.full(11, 0.01), np.full(11, 1.0), 0.1)
+    assert stress.load(scene, strained).tension_clamped
+    assert not stress.load(paper({"stress.integrator": integrator}), strained).tension_clamped
+
+
+def test_shear_stress_held_at_zero_is_told_where_pressure_is_not():
+    """Explicit steps take off at unloading what they have not put on: here all shear, and not all pressure."""
+    scene = constant_phi({"stress.integrator": "euler"})
+    state = stress.load(scene, motion([0.5, 1.0, -1.0, 0.5], [0.4, 0.7, 0.2, 0.2], 0.1))
+    assert state.pressure[0, -1] > 0
+    assert state.shear_stress[0, -1] == 0
+    assert state.tension_clamped
+
+
 def test_only_compacting_points_crush():
     """Eq. 1's Heaviside: pressure left over while the bed dilates crushes nothing."""
     scene = paper()

@@ -124,6 +124,11 @@ def test_tests_of_a_minimal_table_leave_the_rest_unmeasured(tmp_path):
     assert test.total == pytest.approx([0.35, 1.0])
 
 
+def test_a_dry_test_has_no_moisture(tmp_path):
+    [test] = read_tests(tmp_path, operations="test,U_m_s,Fsp_N_mm2,moisture_pct\nA,1,2,0\n")
+    assert test.moisture == 0.0
+
+
 def test_nothing_is_derived_and_single_empty_cells_stay_nan(tmp_path):
     [test] = read_tests(tmp_path)
     assert (test.power, test.throughput) == pytest.approx((36e3, 5.0))
@@ -185,6 +190,7 @@ def test_impossible_products_are_refused(tmp_path, old, new, words):
     [
         ("A,0.5", "A,0", "o.csv: line 2, U_m_s: got '0'; must be above 0; correct the cell"),
         ("A,0.5", "A,-1", "o.csv: line 2, U_m_s: got '-1'"),
+        ("0.5,", ",", "o.csv: line 2, U_m_s: got an empty cell"),
         ("2.5,", ",", "o.csv: line 2, Fsp_N_mm2: got an empty cell"),
         (",36,", ",-36,", "o.csv: line 2, P_kW: got '-36'"),
         (",36,", ",inf,", "o.csv: line 2, P_kW: got 'inf'; must be a finite number"),
