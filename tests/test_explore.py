@@ -535,6 +535,14 @@ def test_a_user_moves_sliders_and_pins_points(browser, three, tmp_path):
     assert float(p80[7]) == pytest.approx(float(expected("p80_total", 1e3, 0, 0, 0)), rel=1e-5)
     assert sum(row[3] == "fraction passing (whole gap)" for row in rows) == len(page.traces("sizes")[0]["x"])
 
+    # printed two charts in a row, and afterwards as wide as before
+    width = "document.querySelector('#across .main-svg').getBoundingClientRect().width"
+    before = page.run(f"return {width}")
+    page.run("window.dispatchEvent(new Event('beforeprint'))")
+    page.wait(f"return {width} < 320")
+    page.run("window.dispatchEvent(new Event('afterprint'))")
+    page.wait(f"return Math.abs({width} - {before}) < 2")
+
     # on a phone
     small = {"width": 360, "height": 740, "deviceScaleFactor": 2, "mobile": True}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", small)
