@@ -18,7 +18,14 @@ from studies.plots import extremes as plots
 
 INF = math.inf
 KNOWN = ranges.numeric_fields()
-COSTLY = {"stress.substeps", "resolution.streamlines", "resolution.points", "resolution.cells"}
+COSTLY = {
+    "stress.substeps",
+    "exchange.segregation",
+    "exchange.mixing",
+    "resolution.streamlines",
+    "resolution.points",
+    "resolution.cells",
+}
 
 
 # --- the catalogue, row by row, and each field to its ends -------------------------------------------------------
