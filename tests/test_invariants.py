@@ -28,6 +28,7 @@ KNOWN = {
 }
 
 
+@settings(max_examples=sized(40, 10))
 @given(
     st.dictionaries(st.sampled_from(sorted(KNOWN)), st.floats(0, 1), max_size=8),
     st.sampled_from(sorted(extremes.FEEDS)),
