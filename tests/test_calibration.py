@@ -51,34 +51,36 @@ def measured(scene, test, noise=0.0, seed=0):
     )  # fmt: skip
 
 
-def test_planted_parameters_are_recovered(pilot_tests):
-    names = list(PLANTED)
-    tests = [measured(planted(names), pilot_tests[name]) for name in ("K-P1", "K-P3")]
-    found = fit_tests(start(), tests, names)
+@pytest.mark.parametrize("names", [["K", "alpha", "T_0"], ["sigma_m", "w", "gamma"], ["kappa", "K", "sigma_m"]],
+                         ids=["machine", "ore", "both"])  # fmt: skip
+def test_planted_parameters_are_recovered(pilot_tests, names):
+    wide = "kappa" in names
+    tests = [measured(planted(names, wide), pilot_tests[name]) for name in ("K-P1", "K-P3")]
+    found = fit_tests(start(wide), tests, names)
     for name in names:
         assert found.estimates[name].value == pytest.approx(PLANTED[name], rel=5e-3), name
         assert found.estimates[name].unit == hpgr.scene.field_info(PARAMETERS[name].field).unit
     assert not found.undetermined
     assert not found.at_bound
     residuals = np.concatenate([part for test in found.residuals.values() for part in test.values()])
-    assert np.abs(residuals).max() < 0.1
+    assert np.abs(residuals).max() < 0.2
     # it then predicts a test it has not seen
-    unseen = measured(planted(names), pilot_tests["K-P5"])
-    assert found.predict(unseen).total == pytest.approx(unseen.total, abs=2e-3)
+    unseen = measured(planted(names, wide), pilot_tests["K-P4"])
+    assert found.predict(unseen).total == pytest.approx(unseen.total, abs=4e-3)
     assert found.predict(unseen).power == pytest.approx(unseen.power, rel=5e-3)
 
 
 def test_intervals_cover_the_planted_values_and_tell_the_noise(pilot_tests):
-    """Of 2 parameters in 5 samples, 10 intervals of 95 %: fewer than 7 cover by chance once in 1,000."""
+    """Of 2 parameters in 3 samples, 6 intervals of 95 %: fewer than 4 cover by chance twice in 1,000."""
     names = ["sigma_m", "gamma"]
     scene = planted(names, roll_width=False)
     covered, widths = 0, []
-    for seed in range(5):
+    for seed in range(3):
         test = measured(scene, pilot_tests["K-P1"], noise=0.5, seed=seed)
         found = fit_tests(start(False), [test], names)
         covered += sum(found.estimates[name].low <= PLANTED[name] <= found.estimates[name].high for name in names)
         widths.append(found.estimates["gamma"].high / found.estimates["gamma"].low - 1)
-    assert covered >= 7
+    assert covered >= 4
     assert 0.005 < np.median(widths) < 0.2
 
 

@@ -63,10 +63,11 @@ def figure4(result: xr.Dataset) -> Figure:
         panel.set_title(title)
     _along_mid_gap(panels[2], result)
     _across_gap(panels[3], result)
-    words = (
-        "Grey: rolls. Dashed: between the two lines the bed compacts, and can crush (eq. 1's Heaviside function); "
-        "above them it dilates and carries no stress."
+    dashed = (
+        "Dashed: between the two lines the bed compacts, and can crush (eq. 1's Heaviside function); above them it "
+        "dilates and carries no stress."
     )
+    words = f"Grey: rolls. {dashed}" if (result["volumetric_strain_rate"] > 0).any() else "Grey: rolls."
     _caption(figure, result, words, limits=True)
     return figure
 
@@ -187,7 +188,7 @@ def _streamlines(panel, result: xr.Dataset) -> None:
 def _field(panel, result: xr.Dataset, values: xr.DataArray, cmap, form: str):
     """Draw a field from roll to roll with labelled contour lines; return what a colour bar is for."""
     x, height, shown = 1e3 * result["x"].values, 1e3 * result["height"].values, values.values.astype(float)
-    drawn = panel.pcolormesh(x, height, shown, cmap=cmap, shading="gouraud", vmin=0, rasterized=True)
+    drawn = panel.pcolormesh(x, height, shown, cmap=cmap, shading="gouraud", vmin=0, vmax=shown.max() or 1.0)
     if shown.max() > shown.min():
         step = _round_step(float(shown.max()) / 5)
         levels = np.arange(step, shown.max(), step)
@@ -242,7 +243,7 @@ def _across_gap(panel, result: xr.Dataset) -> None:
     for roll in (x[0], x[-1]):
         panel.axvline(roll, color="0.3", linewidth=3)
     panel.set(xlim=(x[0], x[-1]), xlabel="x across the gap [mm]", ylabel="stress [MPa]")
-    panel.set_ylim(0, 1.3 * 1e-6 * max(float(result["shear_stress"].max()), 1e-9 + float(result["pressure"].max())))
+    panel.set_ylim(0, 1.3e-6 * max(float(result["shear_stress"].max()), float(result["pressure"].max())) or 1.0)
     panel.set_title("(d) Stresses across the minimum gap (ours)")
     panel.legend(loc="lower center", ncols=2)
     panel.grid(color="0.9")

@@ -31,10 +31,10 @@ def pilot_figure(result: xr.Dataset) -> Figure:
     parts = [Line2D([], [], marker=mark, color=_colour(k), linestyle="none", label=f"measured, {part}")
              for k, (part, mark) in enumerate(_MARKERS.items())]  # fmt: skip
     lines = [Line2D([], [], color="0.3", linestyle=_LINES[k % len(_LINES)], label=name)
-             for k, name in enumerate(sources)]  # fmt: skip
+             for k, name in enumerate(sources) if _drawn(name)]  # fmt: skip
     figure.legend(handles=parts + lines, loc="outside upper center", ncols=4, fontsize=9)
     figure.supxlabel(
-        "Lines: predicted; the model's edge and centre are of the roll width. Baselines are drawn for the total only.",
+        "Lines: predicted; centre and edge are of the roll width. The other models are drawn for the total only.",
         fontsize=9,
     )
     return figure
@@ -47,7 +47,7 @@ def distributions(panel, one: xr.Dataset, sources: list[str]) -> None:
         measured = 100 * one["passing"].sel(source="measured", part=part).values
         panel.plot(sieves, measured, mark, color=_colour(k), markersize=4.5)
         for j, name in enumerate(sources):
-            if j == 0 or (part == "total" and "gap given" not in name):
+            if j == 0 or (part == "total" and _drawn(name)):
                 values = 100 * one["passing"].sel(source=name, part=part).values
                 seen = np.isfinite(values)
                 panel.plot(sieves[seen], values[seen], _LINES[j % len(_LINES)], color=_colour(k), linewidth=1.2)
@@ -79,6 +79,11 @@ def figure_errors(panel, result: xr.Dataset, sources: list[str]) -> None:
     panel.set_title(f"full: {sources[0]}; hollow: other models; dotted: 10 %", fontsize=10)
     panel.legend(fontsize=8)
     panel.grid(color="0.9")
+
+
+def _drawn(source: str) -> bool:
+    """Whether a model's size distributions are drawn: with the gap given they crowd the others."""
+    return "gap given" not in source
 
 
 def _colour(k: int):
