@@ -55,10 +55,12 @@ def measured(scene, test, noise=0.0, seed=0):
                          ids=["machine", "ore", "both"])  # fmt: skip
 def test_planted_parameters_are_recovered(pilot_tests, names):
     wide = "kappa" in names
-    tests = [measured(planted(names, wide), pilot_tests[name]) for name in ("K-P1", "K-P3")]
+    known = ("K-P1", "K-P3")[: 1 if wide else 2]  # centre and edge are two pressures in one test
+    tests = [measured(planted(names, wide), pilot_tests[name]) for name in known]
     found = fit_tests(start(wide), tests, names)
     for name in names:
-        assert found.estimates[name].value == pytest.approx(PLANTED[name], rel=5e-3), name
+        # strength and its size effect trade off along a valley, whose bottom the fit follows until it is flat
+        assert found.estimates[name].value == pytest.approx(PLANTED[name], rel=1e-2), name
         assert found.estimates[name].unit == hpgr.scene.field_info(PARAMETERS[name].field).unit
     assert not found.undetermined
     assert not found.at_bound
