@@ -12,6 +12,7 @@ import hpgr
 from hpgr import feed, geometry, pipeline
 from studies import paper as study
 from studies import store
+from studies.plots import paper as plots
 
 SMALL = {"resolution.streamlines": 4, "resolution.points": sized(81, 41), "resolution.cells": sized(400, 100)}
 SHOWN = 24
@@ -291,3 +292,17 @@ def test_help_explains_every_option_and_loads_nothing_heavy():
     loaded = set(re.findall(r"'([\w.]+)'", done.stderr))
     assert "studies.paper" in loaded
     assert not loaded & {"numba", "xarray", "matplotlib", "distributed", "dask", "netCDF4", "scipy", "pint", "PIL"}
+
+
+def test_scenes_in_which_nothing_happens_are_drawn(tmp_path):
+    """No pressure at all, hence no contour lines, no crushing, and one size everywhere in the animation."""
+    small = {"resolution.streamlines": 1, "resolution.points": 11, "resolution.cells": 20, "flow.exponent": 2.0}
+    scene = hpgr.presets.khd_pilot().with_values(small)
+    result = study.study(scene, 6, assumptions=False)
+    assert not result["pressure"].any()
+    assert "the bed is not compacted" in study.findings(result)[0]
+    for draw in (plots.figure3, plots.figure4, plots.figure5):
+        draw(result).savefig(tmp_path / "figure.png", dpi=30)
+    plots.startup_animation(result, tmp_path / "startup.gif")
+    with Image.open(tmp_path / "startup.gif") as gif:
+        assert gif.info["duration"] >= 400

@@ -270,6 +270,15 @@ def test_shear_beyond_the_limit_is_taken_as_plastic():
     assert ratio == pytest.approx(math.sqrt(4.5 * ore.shear_modulus / ore.bulk_modulus), rel=1e-9)
 
 
+def test_a_tiny_shear_limit_is_kept_to_the_last_bit():
+    """The plain sum of shear is ten million times the limit, and loses as many digits of it."""
+    soft = {"material.bulk_modulus": 1.0, "material.shear_modulus": 1e12, "material.elastic_exponent": 9.9}
+    scene = paper({**soft, "resolution.cells": 0, "resolution.points": 2001})
+    state = stress.load(scene, flow.move(scene, geometry.bed(scene.rolls, 3), 2001))
+    assert state.on_shear_limit.any()
+    assert np.all(state.shear_strain <= stress.largest_shear_ratio(scene.material) * state.volumetric_strain)
+
+
 def test_solid_fraction_is_capped_and_continuity_told():
     state = stress.load(paper(), motion(np.full(11, 1.0), np.zeros(11), 0.1))
     assert state.solid_fraction.max() == 0.9
