@@ -70,14 +70,20 @@ class Options:
     """Running dask scheduler to use instead, such as tcp://127.0.0.1:8786."""
     exchange: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Switch on segregation and mixing between streamlines, as the scene says, or else with default strength."""
+    record: Literal["product", "distributions", "cells"] = "product"
+    """What is kept of every case beside its summary: a file of distributions or cells, for studies.open_cases."""
+    timeout: Annotated[float | None, shown_as("SECONDS")] = None
+    """Time that a case may take; cases then run in processes of their own, and one that hangs or dies is named."""
+    force: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Compute every case, also those that are finished already in <out>.cases."""
     seed: Annotated[int, shown_as("N")] = 0
     """Seed of all randomness; the same seed gives the same bits."""
     out: Annotated[Path | None, shown_as("FILE")] = None
-    """NetCDF file to write (default: outputs/<study>.nc); the figure goes beside it as .png."""
+    """NetCDF file to write (default: outputs/<study>.nc); beside it the figure, .png, and finished cases, .cases."""
     plot: bool = True
     """Draw the figure, or not."""
     dry_run: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """List the cases with their predicted memory and time, and run none."""
+    """List the cases with their predicted memory and time, say which are finished already, and run none."""
 
 
 def refusing(command: Callable[..., int]) -> Callable[..., int]:
@@ -91,6 +97,9 @@ def refusing(command: Callable[..., int]) -> Callable[..., int]:
             message = "the scene is refused:\n  " + faults_of(error, separator="\n  ")
         except (OSError, ValueError, MemoryError) as error:
             message = str(error)
+        except KeyboardInterrupt:
+            print("interrupted; finished cases are kept, and the same command goes on from there", file=sys.stderr)
+            return 130
         print(f"error: {message}", file=sys.stderr)
         return 2
 
@@ -114,14 +123,16 @@ def run(study: Study, arguments: Sequence[str] | None = None) -> int:
         raise ValueError(f"got --workers {options.workers} --replicates {options.replicates}; both must be at least 1")
     refuse_key("--seed", options.seed)
     _check_tolerance(options)
+    if options.timeout is not None and not 0.1 <= options.timeout <= 1e6:
+        raise ValueError(f"--timeout: got {options.timeout:g}; must be 0.1 to 1,000,000 s; such as 60")
     if options.dry_run:
-        _print_cases(scene, axes, options)
+        _print_cases(scene, axes, options, _folder(study, options))
         return 0
     from studies import store
 
     out = _out(study, options)
     store.probe(out)
-    result = _sweep(scene, axes, options)
+    result = _sweep(scene, axes, options, _folder(study, options))
     result.attrs["history"] = _command_line(study, arguments)
     return _report(study, options, result, sieve, out)
 
@@ -197,7 +208,7 @@ def _sieve(options: Options, scene: Scene) -> float:
     return sieve
 
 
-def _sweep(scene: Scene, axes: dict[str, list], options: Options) -> "xr.Dataset":
+def _sweep(scene: Scene, axes: dict[str, list], options: Options, folder: Path) -> "xr.Dataset":
     from studies.sweep import sweep
 
     common = {
@@ -206,6 +217,10 @@ def _sweep(scene: Scene, axes: dict[str, list], options: Options) -> "xr.Dataset
         "replicates": options.replicates,
         "seed": options.seed,
         "progress": True,
+        "folder": folder,
+        "force": options.force,
+        "timeout": options.timeout,
+        "record": options.record,
     }
     if options.scheduler is None:
         return sweep(scene, axes, threads=options.workers, **common)
@@ -215,26 +230,35 @@ def _sweep(scene: Scene, axes: dict[str, list], options: Options) -> "xr.Dataset
         return sweep(scene, axes, client=client, **common)
 
 
-def _print_cases(scene: Scene, axes: dict[str, list], options: Options) -> None:
-    from studies.sweep import enumerate_cases
+def _print_cases(scene: Scene, axes: dict[str, list], options: Options, folder: Path) -> None:
+    from studies.sweep import enumerate_cases, finished_cases
 
+    scene = scene.with_values({"resolution.record": options.record})
+    kept = finished_cases(scene, axes, options.replicates, folder, options.seed, options.tolerance, options.max_cost)
+    if options.force:
+        kept = dict.fromkeys(kept, 0)
+    shows_kept = any(kept.values())
     print(f"{scene}\n")
     names = list(axes)
-    print("".join(f"{_heading(name):>24}" for name in names) + f"{'memory':>12}{'time':>12}")
+    heading = "".join(f"{_heading(name):>24}" for name in names) + f"{'memory':>12}{'time':>12}"
+    print(heading + (f"{'finished':>14}" if shows_kept else ""))
     total = 0.0
     for case in enumerate_cases(axes, 1):
         shown = "".join(f"{units.show(case.values[name], field_info(name).unit):>24}" for name in names)
         try:
-            cost = budget.predict(scene.with_values({**case.values, "resolution.record": "product"}))
+            cost = budget.predict(scene.with_values(case.values))
         except ValidationError as error:
             print(f"{shown}  refused: {faults_of(error)}")
             continue
-        total += cost.seconds * options.replicates
-        print(f"{shown}{cost.bytes / 1e6:>9.1f} MB{cost.seconds * 1e3:>9.1f} ms")
+        done = kept[case.index[:-1]]
+        total += cost.seconds * (options.replicates - done)
+        told = f"{f'{done} of {options.replicates}':>14}" if shows_kept else ""
+        print(f"{shown}{cost.bytes / 1e6:>9.1f} MB{cost.seconds * 1e3:>9.1f} ms{told}")
     if options.tolerance is not None:
         print(f"\nbefore refinement: --tolerance {options.tolerance:g} chooses points and cells when a case is run")
-    count = options.replicates * sum(1 for _ in enumerate_cases(axes, 1))
-    print(f"\n{count} cases ({options.replicates} replicates each), about {total / options.workers:.2g} s on "
+    count, done = options.replicates * len(kept), sum(kept.values())
+    finished = f"{done} of them finished already in {folder}; the others " if done else ""
+    print(f"\n{count} cases ({options.replicates} replicates each), {finished}about {total / options.workers:.2g} s on "
           f"{options.workers} threads, plus start-up")  # fmt: skip
 
 
@@ -270,6 +294,11 @@ def _report(study: Study, options: Options, result: "xr.Dataset", sieve: float, 
 def _out(study: Study, options: Options) -> Path:
     out = options.out or Path("outputs") / f"{study.name}.nc"
     return out if out.suffix == ".nc" else out.with_name(out.name + ".nc")
+
+
+def _folder(study: Study, options: Options) -> Path:
+    """Return where finished cases are kept."""
+    return _out(study, options).with_suffix(".cases")
 
 
 def _caption(study: Study, result: "xr.Dataset") -> str:
