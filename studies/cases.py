@@ -17,11 +17,13 @@ import fcntl
 import functools
 import hashlib
 import json
+import math
 import os
 import secrets
 import struct
 import sys
 import time
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -37,10 +39,10 @@ from studies import store
 from studies.bench import Job, Outcome
 
 _MAGIC = b"hpgrcase"
-_HEAD = struct.Struct("<8sIQ16s")  # magic, bytes of header, bytes of payload, checksum of all else
+_HEAD = struct.Struct("<8sIQ16s")  # magic, bytes of header, bytes of payload, checksum of both; then a CRC of these
+_CRC = struct.Struct("<I")  # so that a damaged size is noticed before that many bytes are read
 _FLUSH_SECONDS = 0.5  # of work that a killed driver loses at most, beside what it is computing
 _FLUSH_BYTES = 8_000_000  # held in memory at most before they are written
-_LONGEST_HEADER = 10_000_000
 
 
 class Damaged(ValueError):
@@ -98,7 +100,7 @@ class Addresses:
     def _text(self, values: Mapping[str, Any]) -> str:
         # A field that is there already is replaced as `Scene.with_values` would, at a tenth of the cost.
         # The resolution's fields decide about each other (levels), and parts may be absent: there the scene is made.
-        if all(name in self._fields and not name.startswith("resolution.") for name in values):
+        if all("." in name and name in self._fields and not name.startswith("resolution.") for name in values):
             fields = self._fields | {name: repr(value) for name, value in values.items()}
         else:
             try:
@@ -129,7 +131,8 @@ def pack(header: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
     listed = [[name, value.dtype.newbyteorder("<").str, value.shape] for name, value in arrays.items()]
     text = json.dumps(header | {"arrays": listed}).encode()
     payload = b"".join(value.astype(value.dtype.newbyteorder("<"), copy=False).tobytes() for value in arrays.values())
-    return _HEAD.pack(_MAGIC, len(text), len(payload), _checksum(text, payload)) + text + payload
+    head = _HEAD.pack(_MAGIC, len(text), len(payload), _checksum(text, payload))
+    return head + _CRC.pack(zlib.crc32(head)) + text + payload
 
 
 def read_packed(file: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -142,9 +145,9 @@ def read_packed(file: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     Damaged
         If these bytes are no intact record.
     """
-    head = _exactly(file, _HEAD.size)
+    head, crc = _exactly(file, _HEAD.size), _exactly(file, _CRC.size)
     magic, text_size, payload_size, checksum = _HEAD.unpack(head)
-    if magic != _MAGIC or text_size > _LONGEST_HEADER:
+    if magic != _MAGIC or _CRC.unpack(crc) != (zlib.crc32(head),):
         raise Damaged("no record begins here")
     text, payload = _exactly(file, text_size), _exactly(file, payload_size)
     if _checksum(text, payload) != checksum:
@@ -152,10 +155,9 @@ def read_packed(file: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     header = json.loads(text)
     arrays, start = {}, 0
     for name, kind, shape in header.pop("arrays"):
-        dtype = np.dtype(kind)
-        stop = start + dtype.itemsize * int(np.prod(shape, dtype=np.int64))
-        arrays[name] = np.frombuffer(payload[start:stop], dtype).reshape(shape)
-        start = stop
+        dtype, count = np.dtype(kind), math.prod(shape)
+        arrays[name] = np.frombuffer(payload, dtype, count, start).reshape(shape)
+        start += dtype.itemsize * count
     return header, arrays
 
 
@@ -167,8 +169,7 @@ def _exactly(file: BinaryIO, size: int) -> bytes:
 
 
 def _checksum(text: bytes, payload: bytes) -> bytes:
-    digest = hashlib.blake2b(struct.pack("<IQ", len(text), len(payload)), digest_size=16)
-    digest.update(text)
+    digest = hashlib.blake2b(text, digest_size=16)
     digest.update(payload)
     return digest.digest()
 
