@@ -88,10 +88,11 @@ def _own_groups() -> list[Path]:
 def _left_in(group: Path, limit_file: str, used_file: str, cache: str) -> int | None:
     """Return the bytes left in a control group, or None if it has no limit."""
     try:
-        limit, used = int((group / limit_file).read_text()), int((group / used_file).read_text())
+        limit = int((group / limit_file).read_text())
+        if limit >= _NO_LIMIT:
+            return None
+        used = int((group / used_file).read_text())
     except (OSError, ValueError):  # no such group, or "max"
-        return None
-    if limit >= _NO_LIMIT:
         return None
     return max(0, limit - max(0, used - _cached(group, cache)))
 

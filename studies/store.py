@@ -12,6 +12,7 @@ from xarray.backends.locks import HDF5_LOCK, NETCDFC_LOCK, combine_locks
 # The NetCDF and HDF5 libraries stand no two threads at once, whichever files these are at. xarray holds these locks
 # while it reads; what reads here beside it holds the same ones.
 _LIBRARY = combine_locks([NETCDFC_LOCK, HDF5_LOCK])
+_looked_at: set[tuple[int, ...]] = set()  # files found harmless, and not changed since: a look costs milliseconds
 _HARMLESS_FILTERS = {1: "deflate", 2: "shuffle", 3: "fletcher32", 4: "szip", 5: "nbit", 6: "scaleoffset"}
 
 
@@ -96,7 +97,9 @@ def refuse_foreign_storage(path: str | Path) -> None:
         If it cannot be read.
     """
     with open(path, "rb") as file:  # and so never an address on a network
-        if file.read(3) == b"CDF":  # NetCDF-3 has no such things
+        state = os.fstat(file.fileno())
+        seen = (state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
+        if seen in _looked_at or file.read(3) == b"CDF":  # NetCDF-3 has no such things
             return
     import h5py
 
@@ -108,6 +111,9 @@ def refuse_foreign_storage(path: str | Path) -> None:
             raise ValueError(f"{path}: cannot be read as NetCDF; it is no such file, or damaged ({error})") from error
     if fault is not None:
         raise ValueError(f"{path}: {fault}; refused unread; only open files whose values are their own")
+    if len(_looked_at) > 100_000:
+        _looked_at.clear()
+    _looked_at.add(seen)
 
 
 def _faults(group, seen: set) -> Iterator[str]:
