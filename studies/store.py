@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -9,9 +10,44 @@ import numpy as np
 import xarray as xr
 from xarray.backends.locks import HDF5_LOCK, NETCDFC_LOCK, combine_locks
 
-# The NetCDF and HDF5 libraries stand no two threads at once, whichever files these are at. xarray holds these locks
-# while it reads; what reads here beside it holds the same ones.
-_LIBRARY = combine_locks([NETCDFC_LOCK, HDF5_LOCK])
+
+class _LibraryLock:
+    """The NetCDF and HDF5 libraries stand no two threads at once, whichever files these are at.
+
+    xarray holds locks of its own while it reads values, but none while it opens a file. Whoever holds this one holds
+    those too; the thread that holds it may take it again. In another process it is that process's lock.
+    """
+
+    def __init__(self):
+        self._own, self._theirs, self._depth = threading.RLock(), combine_locks([NETCDFC_LOCK, HDF5_LOCK]), 0
+
+    def acquire(self, *arguments, **options):
+        self._own.acquire()
+        if self._depth == 0:
+            self._theirs.__enter__()
+        self._depth += 1
+        return True
+
+    def release(self):
+        self._depth -= 1
+        if self._depth == 0:
+            self._theirs.__exit__(None, None, None)
+        self._own.release()
+
+    def locked(self):
+        return self._depth > 0
+
+    def __enter__(self):
+        self.acquire()
+
+    def __exit__(self, *_):
+        self.release()
+
+    def __reduce__(self):
+        return "_LIBRARY"
+
+
+_LIBRARY = _LibraryLock()
 _looked_at: set[tuple[int, ...]] = set()  # files found harmless, and not changed since: a look costs milliseconds
 _HARMLESS_FILTERS = {1: "deflate", 2: "shuffle", 3: "fletcher32", 4: "szip", 5: "nbit", 6: "scaleoffset"}
 
@@ -46,7 +82,8 @@ def open_result(path: str | Path) -> xr.Dataset:
         If it cannot be read.
     """
     refuse_foreign_storage(path)
-    return xr.open_dataset(path, engine="netcdf4")
+    with _LIBRARY:
+        return xr.open_dataset(path, engine="netcdf4", lock=_LIBRARY)
 
 
 def read_variable(path: str | Path, name: str, address: str | None = None) -> np.ndarray:

@@ -53,17 +53,15 @@ def alone(base, record, gap, speed, replicate):
 def test_every_case_is_what_simulate_gives(base, folder, record):
     cases = studies.open_cases(folder)
     assert cases["status"].values[:, 0, 0].tolist() == [0, 0, STATUS["refused"], 0]
-    for gap in (0, 1, 3):
-        for speed in (0, 1):
-            for replicate in (0, 1):
-                place = cases.isel(gap=gap, roll_speed=speed, replicate=replicate)
-                single = alone(base, record, AXES["rolls.gap"][gap], AXES["rolls.speed"][speed], replicate)
-                for name in single.data_vars:
-                    assert np.array_equal(place[name].values, single[name].values), name
-                    assert place[name].dims == single[name].dims
-                    assert place[name].attrs.keys() == single[name].attrs.keys()
-                for name in single.coords:
-                    assert np.allclose(place[name].values, single[name].values, rtol=1e-7), name
+    for gap, speed, replicate in ((0, 1, 0), (3, 0, 1)):
+        place = cases.isel(gap=gap, roll_speed=speed, replicate=replicate).load()
+        single = alone(base, record, AXES["rolls.gap"][gap], AXES["rolls.speed"][speed], replicate)
+        for name in single.data_vars:
+            assert np.array_equal(place[name].values, single[name].values), name
+            assert place[name].dims == single[name].dims
+            assert place[name].attrs.keys() == single[name].attrs.keys()
+        for name in single.coords:
+            assert np.allclose(place[name].values, single[name].values, rtol=1e-7), name
     lost = cases.isel(gap=2)
     assert lost["pressure"].isnull().all()
 
@@ -86,7 +84,8 @@ def test_reductions_over_two_threads(folder, record):
     """What a user does with it, on two threads beside a third that reads through xarray itself."""
     name = {"distributions": "mass_fraction", "cells": "size"}[record]
     cases = studies.open_cases(folder)
-    loaded = xr.Dataset({key: (value.dims, value.values) for key, value in cases.items()})
+    used = [name, "pressure", "solid_fraction"]
+    loaded = xr.Dataset({key: (cases[key].dims, cases[key].values) for key in used})
     some = next(folder.glob("*.nc"))
     stop = threading.Event()
 
@@ -99,7 +98,7 @@ def test_reductions_over_two_threads(folder, record):
     beside.start()
     try:
         with dask.config.set(scheduler="threads", num_workers=2):
-            for _ in range(sized(4, 1)):
+            for _ in range(sized(2, 1)):
                 mean = cases[name].mean(["replicate", "streamline"]).compute()
                 peak = cases["pressure"].max(["point", "streamline"]).compute()
                 both = (cases["pressure"] * cases["solid_fraction"]).std("gap").compute()
