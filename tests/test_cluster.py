@@ -135,17 +135,22 @@ def test_worker_killed_on_the_way_changes_no_bit(base, cluster, tmp_path):
 
 def test_lost_scheduler_is_told_and_finished_cases_are_kept(base, tmp_path):
     with runner.own_client(1) as client:
-        real = runner._settle
-        calls = []
+        real, submit = runner._settle, client.submit
+        calls, sent = [], []
 
         def settle(future, batch, again):
             calls.append(batch)
             if len(calls) == 3:
-                client.cancel(list(client.futures))  # what a client does when its scheduler has gone
+                client.cancel(sent)  # what a client does when its scheduler has gone
             return real(future, batch, again)
+
+        def submit_seen(*arguments, **options):
+            sent.append(submit(*arguments, **options))
+            return sent[-1]
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(runner, "_settle", settle)
+            patch.setattr(client, "submit", submit_seen)
             with pytest.raises(ConnectionError, match=r"lost the dask scheduler.*run the same command again"):
                 sweep(base, AXES, client=client, folder=tmp_path)
     assert list(tmp_path.glob("*.seg"))
