@@ -2,7 +2,8 @@
 
 The cases are nearly empty (stress only, 2 streamlines of 10 points), so what they take beside their own few tenths of
 a millisecond is overhead. Every figure is the median of repeats in this one process, ratios are of figures measured
-in turns; in brackets the same of processor time, which other work on the machine disturbs less; start-up of the default cluster, about a quarter of a second, is included.
+in turns; in brackets the same of processor time, which other work on the machine disturbs less. Start-up of the
+default cluster, about a quarter of a second, is included.
 """
 
 import gc
@@ -100,8 +101,8 @@ def main():
                                 computing.megabytes, reading.megabytes))  # fmt: skip
             figures = [statistics.median(column) for column in zip(*figures, strict=True)]
             figures = [1e3 * value / count if k in (0, 1, 2, 3, 6, 7) else value for k, value in enumerate(figures)]
-            print("{:6d} {:8.2f} ({:5.2f}) {:8.2f} ({:5.2f}) {:5.2f} ({:4.2f}) {:8.3f} ({:5.3f}) {:8.0f} {:8.0f}".format(
-                count, *figures), flush=True)  # fmt: skip
+            line = "{:6d} {:8.2f} ({:5.2f}) {:8.2f} ({:5.2f}) {:5.2f} ({:4.2f}) {:8.3f} ({:5.3f}) {:8.0f} {:8.0f}"
+            print(line.format(count, *figures), flush=True)
         full = hpgr.presets.paper()
         axes, folder = axes_of(1000), home / "full"
         ratios = []
@@ -116,13 +117,12 @@ def main():
         axes = axes_of(20_000)
         with Peak() as computing:
             seconds, used, _ = timed(lambda: sweep(few, axes, folder=home / "many"))
-        print(
-            f"20,000 cases with summaries of full size: {seconds:.0f} s ({used:.0f} s), peak {computing.megabytes:.0f} MB above before"
-        )
+        print(f"20,000 cases with summaries of full size: {seconds:.0f} s ({used:.0f} s)")
+        print(f"  peak {computing.megabytes:.0f} MB above before")
         with Peak() as reading:
             seconds, used, result = timed(lambda: sweep(few, axes, folder=home / "many"))
-        print(f"  read back and assembled: {seconds:.1f} s ({used:.1f} s), peak {reading.megabytes:.0f} MB above before, of which the "
-              f"result {result.nbytes / 1e6:.0f} MB")  # fmt: skip
+        print(f"  read back and assembled: {seconds:.1f} s ({used:.1f} s)")
+        print(f"  peak {reading.megabytes:.0f} MB above before, of which the result {result.nbytes / 1e6:.0f} MB")
         seconds, used, _ = timed(lambda: store.write_dataset(result, home / "many.nc"))
         kept = sum(path.stat().st_size for path in (home / "many").iterdir())
         segments = len(list((home / "many").glob("*.seg")))
