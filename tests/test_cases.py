@@ -153,7 +153,7 @@ def test_what_is_put_is_found_after_a_flush(tmp_path, monkeypatch):
         kept.flush()
         assert addresses(kept.folder) == [A]
         kept.put(B, outcome(2))
-    assert addresses(kept.folder) == [A, B]
+    assert addresses(kept.folder) == sorted([A, B])
     [found] = read_folder(kept.folder, B.__eq__)
     back = cases.outcome_of(found.header, found.arrays, (7,))
     assert (back.index, back.status, back.notes) == ((7,), "ok", "note 2")
@@ -177,6 +177,17 @@ def test_a_driver_sees_what_another_puts(tmp_path):
             other.flush()  # at once after the look: within the same tick of the file system's clock
             assert [found.arrays["throughput"] for found in one.read(lambda _: True)] == [number]
         assert list(one.read(lambda _: True)) == []
+
+
+def test_a_change_within_a_tick_of_the_file_system_clock_is_seen(tmp_path, monkeypatch):
+    with CaseFolder(tmp_path) as one, CaseFolder(tmp_path) as other:
+        stamp = tmp_path.stat().st_mtime_ns
+        monkeypatch.setattr(cases.time, "time_ns", lambda: stamp + 1_000_000)  # the look comes 1 ms after the change
+        assert list(one.read(lambda _: True)) == []
+        other.put(A, outcome(1))
+        other.flush()
+        os.utime(tmp_path, ns=(stamp, stamp))
+        assert [found.address for found in one.read(lambda _: True)] == [A]
 
 
 def test_claims_exclude_other_drivers_and_vanish_with_them(tmp_path):
