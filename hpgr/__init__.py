@@ -24,6 +24,8 @@ _HOMES = {
     "throughput": "metrics",
     "peak_pressure": "metrics",
     "reduction_ratio": "metrics",
+    "operating_gap": "machine",
+    "calibrate": "calibration",
 }
 
 __all__ = [*_HOMES, "presets"]

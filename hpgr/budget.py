@@ -37,10 +37,11 @@ def predict(scene: Scene) -> Cost:
     size = 240 * fields  # the arrays of motion and load, 8 bytes each, with their temporaries
     seconds = 2.5e-3 + 1.5e-6 * fields
     if cells:
-        product = 4 * grid.photographs * lines * cells
+        columns = lines * (1 if scene.roll_width is None else 2 * scene.roll_width.slices)
+        product = 4 * grid.photographs * columns * cells
         at_once = max(os.cpu_count() or 1, 200_000 // cells)  # parcels, see hpgr.solve
-        size += 3 * product + 40 * cells * min(lines * grid.photographs, at_once)  # kept, pooled, sorted; work space
-        seconds += grid.photographs * lines * cells * (0.28e-6 + 0.15e-9 * points)
+        size += 3 * product + 40 * cells * min(columns * grid.photographs, at_once)  # kept, pooled, sorted; work space
+        seconds += grid.photographs * columns * cells * (0.28e-6 + 0.15e-9 * points)
         frames = grid.photographs
         if scene.exchange is not None:
             frames += -(-(points - 1) // scene.exchange.interval) if scene.exchange.record_startup else 0

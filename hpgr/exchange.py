@@ -89,7 +89,7 @@ def refuse_passes(scene: Scene, rates: SwapRates, passes: int) -> None:
     if passes > MOST_PASSES:
         seconds = passes * rates.pairs.shape[0] * scene.resolution.points * _SECONDS_PER_EDGE
         raise ValueError(
-            f"exchange: segregation {scene.exchange.segregation:g} and mixing {scene.exchange.mixing:g} need "
+            f"exchange: got segregation {scene.exchange.segregation:g} and mixing {scene.exchange.mixing:g}; they need "
             f"{passes:,} passes per time step to keep swap probabilities at {LARGEST_SUM:g}, must be at most "
             f"{MOST_PASSES:,}; predicted cost above {seconds:,.0f} s; use fewer points or streamlines, a larger "
             "flow.entry_fraction, or weaker exchange"

@@ -47,7 +47,8 @@ def _quantile(feed: Feed, fraction: np.ndarray) -> np.ndarray:
 
 
 def _rosin_rammler(feed: Feed, size):
-    return -np.expm1(-((np.maximum(size, 0.0) / feed.size) ** feed.exponent))
+    with np.errstate(over="ignore"):  # far above the size all of it passes: exp(-inf) is 0
+        return -np.expm1(-((np.maximum(size, 0.0) / feed.size) ** feed.exponent))
 
 
 def _scalped(feed: Feed) -> float:

@@ -12,6 +12,7 @@ from hpgr import feed as feeds
 from hpgr.scene import Feed, Material
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(200)  # made once: they cost more than the rest of a case
+_PARTS = 16  # that an interval is divided into while searching
 _FINEST = 1e-30  # m, below any grain; where percentiles are searched from
 
 
@@ -38,17 +39,21 @@ def crushed_passing(feed: Feed, size, critical, gamma: float) -> np.ndarray:
         Fragment exponent.
     """
     size, critical = np.broadcast_arrays(np.asarray(size, dtype=float), np.asarray(critical, dtype=float))
-    crushed = (1 - feeds.passing(feed, critical)) * (size / critical) ** gamma  # 0 where s_c is inf
+    crushed = (1 - feeds.passing(feed, critical)) * np.minimum(size / critical, 1.0) ** gamma  # 0 where s_c is inf
     return np.where(size < critical, feeds.passing(feed, size) + crushed, 1.0)
 
 
 def percentile(passing, fraction, coarsest: float) -> np.ndarray:
-    """Return the sizes in m at which the rising function `passing` reaches `fraction`, in the shape of the latter."""
+    """Return the sizes in m at which `passing` reaches `fraction`, in the shape of the latter.
+
+    `passing` rises with size and takes any axes before those of `fraction`.
+    """
     low, high = np.full_like(fraction, np.log(_FINEST)), np.full_like(fraction, np.log(coarsest))
-    for _ in range(52):  # halves 70 nepers to rounding
-        middle = (low + high) / 2
-        above = passing(np.exp(middle)) >= fraction
-        low, high = np.where(above, low, middle), np.where(above, middle, high)
+    inner = np.arange(1, _PARTS).reshape(-1, *(1,) * fraction.ndim) / _PARTS
+    for _ in range(13):  # 16^13 = 2^52: narrows 70 nepers to rounding, in a quarter of the time of halving
+        width = high - low
+        below = np.sum(passing(np.exp(low + width * inner)) < fraction, axis=0)  # passing rises
+        low, high = low + width * (below / _PARTS), low + width * ((below + 1) / _PARTS)
     return np.exp(high)
 
 

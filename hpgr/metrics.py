@@ -150,7 +150,9 @@ def _require_sizes(dataset: xr.Dataset) -> None:
 
 
 def _steady(recorded: xr.DataArray) -> xr.DataArray:
-    """Return the photographs that are not of the start-up."""
+    """Return the photographs that are not of the start-up, over `time`, which a file calls `photograph`."""
+    if "photograph" in recorded.dims:
+        recorded = recorded.rename(photograph="time")
     if "steady" not in recorded.coords:
         return recorded
     return recorded.isel(time=np.flatnonzero(recorded["steady"].values))

@@ -9,7 +9,7 @@ from hpgr.scene import Scene
 def constants(scene: Scene) -> tuple[float, float, float, float, float]:
     """Return slope, cushion, inverse_gamma, strength_size and size_floor, as `hpgr.kernels.crush` takes them."""
     ore = scene.material
-    cushion = 1 / (2 * ore.cushioning**2)
+    cushion = 1 / (2 * ore.cushioning * ore.cushioning)  # a power would raise where the product is inf
     return 3 / ore.weibull_modulus, cushion, 1 / ore.fragment_exponent, ore.strength_size, ore.size_floor
 
 

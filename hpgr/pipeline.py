@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hpgr import exchange, flow, geometry, metrics, schema, solve, stress, tessellation
+from hpgr import exchange, flow, geometry, machine, metrics, schema, solve, stress, tessellation, width
 from hpgr.scene import Scene
 
 _NIPPING = 1.5  # top size over gap above which rolls nip single grains, which is not modelled
@@ -27,6 +27,8 @@ class Prepared(NamedTuple):
         (streamline, point) Voronoi volumes per roll width, m2, of a scene with exchange.
     rates : hpgr.exchange.SwapRates or None
         Swap rates of a scene with exchange.
+    pressed : hpgr.machine.Press
+        Force and power per roll width.
     """
 
     bed: geometry.Geometry
@@ -35,6 +37,7 @@ class Prepared(NamedTuple):
     crushing: np.ndarray
     volume: np.ndarray | None
     rates: exchange.SwapRates | None
+    pressed: machine.Press
 
 
 def bed_key(scene: Scene) -> tuple:
@@ -61,15 +64,18 @@ def prepare(scene: Scene) -> Prepared:
     """
     points, substeps = scene.resolution.points, scene.stress.substeps
     bed = geometry.bed(scene.rolls, scene.resolution.streamlines)
-    fine = flow.move(scene, bed, (points - 1) * substeps + 1)
+    walled = bed._replace(xi=np.append(bed.xi, 1.0))  # the roll itself, whose force and power are wanted
+    fine = flow.move(scene, walled, (points - 1) * substeps + 1)
     state = stress.load(scene, fine)
+    pressed = machine.press(scene, walled, fine, state)
     crushing = stress.crushing_stress(scene, fine, state)
-    motion, state, crushing = (_every(substeps, part) for part in (fine, state, crushing))
-    motion = motion._replace(time_step=substeps * fine.time_step)
+    motion, state, crushing = (_kept(substeps, part) for part in (fine, state, crushing))
+    motion = motion._replace(time_step=substeps * fine.time_step, onset=None)
     if solve.choose(scene) != "lattice":
-        return Prepared(bed, motion, state, crushing, None, None)
+        return Prepared(bed, motion, state, crushing, None, None, pressed)
     cells = tessellation.tessellate(scene, bed, motion)
-    return Prepared(bed, motion, state, crushing, cells.volume, exchange.swap_rates(scene, motion, state, cells))
+    rates = exchange.swap_rates(scene, motion, state, cells)
+    return Prepared(bed, motion, state, crushing, cells.volume, rates, pressed)
 
 
 def crush(scene: Scene, prepared: Prepared, seed: int, replicate: int) -> dict[str, Any]:
@@ -79,8 +85,9 @@ def crush(scene: Scene, prepared: Prepared, seed: int, replicate: int) -> dict[s
     """
     bed, motion, state = prepared.bed, prepared.motion, prepared.state
     crushed = solve.crush(scene, prepared.crushing, motion.time_step, prepared.rates, seed, replicate)
-    values = _fields(bed, motion, state) | _summaries(scene, motion, state) | _product(scene, crushed)
-    notes = _notes(scene, bed, state, crushed)
+    summaries = _summaries(scene, prepared)
+    values = _fields(bed, motion, state) | summaries | _product(scene, crushed)
+    notes = _notes(scene, prepared, crushed)
     return values | {
         "volume": prepared.volume,
         "flags": sum(schema.FLAGS[name] for name in notes),
@@ -88,16 +95,16 @@ def crush(scene: Scene, prepared: Prepared, seed: int, replicate: int) -> dict[s
     }
 
 
-def _every(step: int, part: Any) -> Any:
-    """Return every step-th point of the arrays within `part` that run over points."""
+def _kept(step: int, part: Any) -> Any:
+    """Return `part` at every step-th point and without the streamline along the roll."""
     if isinstance(part, np.ndarray):
-        return part[..., ::step]
-    over_points = {
-        name: value[..., ::step]
-        for name, value in part._asdict().items()
-        if np.ndim(value) == 2 or name == "residence_time"
-    }
-    return part._replace(**over_points)
+        return part[:-1, ::step] if part.ndim == 2 else part
+    kept = {name: _kept(step, value) for name, value in part._asdict().items() if isinstance(value, np.ndarray)}
+    if "residence_time" in kept:
+        kept["residence_time"] = kept["residence_time"][::step]
+    if "continuity_solid_fraction" in kept:
+        kept["continuity_solid_fraction"] = kept["continuity_solid_fraction"][:-1]
+    return part._replace(**kept)
 
 
 def _fields(bed: geometry.Geometry, motion: flow.Motion, state: stress.Load) -> dict[str, Any]:
@@ -110,6 +117,7 @@ def _fields(bed: geometry.Geometry, motion: flow.Motion, state: stress.Load) -> 
         "volumetric_strain_rate": motion.volumetric_rate,
         "shear_strain_rate": motion.shear_rate,
         "volumetric_strain": state.volumetric_strain,
+        "shear_strain": state.shear_strain,
         "solid_fraction": state.solid_fraction,
         "pressure": state.pressure,
         "shear_stress": state.shear_stress,
@@ -117,14 +125,17 @@ def _fields(bed: geometry.Geometry, motion: flow.Motion, state: stress.Load) -> 
     }
 
 
-def _summaries(scene: Scene, motion: flow.Motion, state: stress.Load) -> dict[str, Any]:
+def _summaries(scene: Scene, prepared: Prepared) -> dict[str, Any]:
+    motion, state = prepared.motion, prepared.state
     pressure = state.pressure
     peak = pressure.argmax(axis=1)
     lines = np.arange(peak.size)
     peaks, heights = pressure[lines, peak], motion.y[lines, peak]
     highest = int(peaks.argmax())
-    return {
-        "throughput": metrics.gap_throughput(scene, float(state.solid_fraction[:, -1].mean())),
+    throughput, felt = _felt(scene, prepared)
+    return felt._asdict() | {
+        "throughput": throughput,
+        "operating_gap": None if scene.rolls.specific_pressing_force is None else scene.rolls.gap,
         "peak_pressure": peaks[highest],
         "peak_pressure_height": heights[highest],
         "streamline_peak_pressure": peaks,
@@ -132,6 +143,11 @@ def _summaries(scene: Scene, motion: flow.Motion, state: stress.Load) -> dict[st
         "continuity_solid_fraction": state.continuity_solid_fraction,
         "shear_limit_fraction": state.on_shear_limit.mean(),
     }
+
+
+def _felt(scene: Scene, prepared: Prepared) -> tuple[float, machine.Figures]:
+    throughput = metrics.gap_throughput(scene, float(prepared.state.solid_fraction[:, -1].mean()))
+    return throughput, machine.figures(scene, prepared.pressed, throughput)
 
 
 def _product(scene: Scene, crushed: solve.Crushed | None) -> dict[str, Any]:
@@ -152,6 +168,8 @@ def _product(scene: Scene, crushed: solve.Crushed | None) -> dict[str, Any]:
         "breaks_per_cell": crushed.breaks,
         "below_floor": crushed.below_floor,
     }
+    if crushed.along_width is not None:
+        values |= _along_width(scene, crushed.along_width)
     exchanged = crushed.exchanged
     if exchanged is not None:
         values |= {"swaps_per_cell": exchanged.swaps_per_cell, "exchange_passes": exchanged.passes}
@@ -160,9 +178,23 @@ def _product(scene: Scene, crushed: solve.Crushed | None) -> dict[str, Any]:
     return values
 
 
-def _notes(scene: Scene, bed: geometry.Geometry, state: stress.Load, crushed: solve.Crushed | None) -> dict[str, str]:
+def _along_width(scene: Scene, found: solve.AlongWidth) -> dict[str, Any]:
+    return {
+        "width_position": width.slices_of(scene).position,
+        "passing_slice": found.passing,
+        "passing_width_centre": found.centre_passing,
+        "passing_width_edge": found.edge_passing,
+        "p50_width_centre": found.centre_percentiles[0],
+        "p80_width_centre": found.centre_percentiles[1],
+        "p50_width_edge": found.edge_percentiles[0],
+        "p80_width_edge": found.edge_percentiles[1],
+    }
+
+
+def _notes(scene: Scene, prepared: Prepared, crushed: solve.Crushed | None) -> dict[str, str]:
     """Return, by flag, a sentence for each limit that was hit."""
     notes = {}
+    bed, state = prepared.bed, prepared.state
     ore, rolls = scene.material, scene.rolls
     needed = float(state.continuity_solid_fraction.max())
     if not state.pressure.any():
@@ -179,7 +211,17 @@ def _notes(scene: Scene, bed: geometry.Geometry, state: stress.Load, crushed: so
             "single grains, which is not modelled"
         )
     if state.tension_clamped:
-        notes["tension_clamped"] = "the elastic law asked for tension; the pressure was held at 0 there"
+        notes["tension_clamped"] = "the elastic law asked for tension or reverse shear; stresses were held at 0 there"
+    if ore.elastic_exponent < 0 and state.pressure.any():
+        notes["no_limit_of_steps"] = (
+            f"with elastic_exponent {ore.elastic_exponent:g}, below 0, stresses need not converge as time steps shrink"
+        )
+    _, felt = _felt(scene, prepared)
+    unusual = machine.unusual(scene, felt, float(state.solid_fraction[:, -1].mean()))
+    if unusual:
+        notes["unusual_machine"] = unusual
+    if felt.force_angle >= np.pi / 2:
+        notes["no_force_angle"] = "the bed takes more power than the force can give at any angle; force_angle is 90 deg"
     if crushed is None:
         return notes
     if not crushed.breaks.any():

@@ -7,7 +7,7 @@ from typing import Any
 
 import xarray as xr
 
-from hpgr import __version__, budget, pipeline, schema, solve
+from hpgr import __version__, budget, machine, pipeline, schema, solve
 from hpgr import tolerance as tolerances
 from hpgr.keys import refuse_key
 from hpgr.pipeline import Prepared
@@ -45,7 +45,8 @@ def simulate(
     ------
     ValueError
         If the seed or replicate is not a whole number from 0 to 2**63 - 1, if material points coincide, if exchange
-        would need absurdly many passes, or if the tolerance cannot be met under `max_cost`.
+        would need absurdly many passes, if no gap carries the scene's pressing force, or if the tolerance cannot be
+        met under `max_cost`.
     MemoryError
         If the scene does not fit this machine's memory; the message has the predicted bytes.
 
@@ -60,9 +61,10 @@ def simulate(
     refuse_key("seed", seed)
     refuse_key("replicate", replicate)
     chosen = {}
+    scene = machine.at_operating_gap(scene)
     if tolerance is not None:
         estimate = tolerances.refine(scene, tolerance, max_cost, seed)
-        scene, chosen = estimate.scene, estimate.variables()
+        scene, chosen = machine.at_operating_gap(estimate.scene), estimate.variables()
     budget.refuse_too_large(scene)
     prepared = pipeline.prepare(scene)
     values = pipeline.crush(scene, prepared, seed, replicate)

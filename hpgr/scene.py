@@ -12,7 +12,7 @@ import numbers
 import operator
 import tomllib
 from collections.abc import Iterator, Mapping
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self, get_args
 
@@ -90,6 +90,8 @@ def _sieve_rows(value: Any) -> Any:
 Metres = Annotated[float, BeforeValidator(partial(_number, unit="m"))]
 RadiansPerSecond = Annotated[float, BeforeValidator(partial(_number, unit="rad s-1"))]
 Pascals = Annotated[float, BeforeValidator(partial(_number, unit="Pa"))]
+Radians = Annotated[float, BeforeValidator(partial(_number, unit="rad"))]
+NewtonMetres = Annotated[float, BeforeValidator(partial(_number, unit="N m"))]
 Density = Annotated[float, BeforeValidator(partial(_number, unit="kg m-3"))]
 Number = Annotated[float, BeforeValidator(partial(_number, unit="1"))]
 Count = Annotated[int, BeforeValidator(_integer)]
@@ -149,17 +151,22 @@ class _Frozen(BaseModel):
                     known |= {f"{name}.{key}": value for key, value in part._known_values(raw).items()}
                 continue
             try:
-                known[name] = _valid_alone(field, raw)
+                known[name] = _valid_alone(cls, name, raw)
             except ValidationError:
                 continue
         return known
 
 
-def _valid_alone(field: Any, value: Any) -> Any:
-    """Return `value` validated against one model field."""
-    strictness = ConfigDict(allow_inf_nan=False)
-    carrier = create_model("Alone", __config__=strictness, value=(field.annotation, field))
-    return carrier.model_validate({"value": value}).value
+def _valid_alone(part: type["_Frozen"], name: str, value: Any) -> Any:
+    """Return `value` validated against one field of a model."""
+    return _carrier(part, name).model_validate({"value": value}).value
+
+
+@cache
+def _carrier(part: type["_Frozen"], name: str) -> type[BaseModel]:
+    """Return a model of one field alone; made once, for making one takes a millisecond."""
+    field = part.model_fields[name]
+    return create_model("Alone", __config__=ConfigDict(allow_inf_nan=False), value=(field.annotation, field))
 
 
 def _part(field: Any) -> type["_Frozen"] | None:
@@ -260,16 +267,25 @@ class Rolls(_Frozen):
         "Gap where the rolls are closest",
         "machine",
         "measure the working gap, such as '20 mm'",
-        gt=0,
+        ge=1e-6,
         le=1e3,
     )
     entry_gap: Metres = _field(
         "s_t", "m", "Distance between the roll surfaces where the modelled bed begins", "machine",
-        "give the height of the modelled bed as the gap there, such as '100 mm'", gt=0, le=1e3,
+        "give the height of the modelled bed as the gap there, such as '100 mm'", ge=1e-6, le=1e3,
     )  # fmt: skip
     speed: RadiansPerSecond = _field(
-        "omega", "rad s-1", "Roll speed", "machine", "give the roll speed, such as '19 rpm'", gt=0, le=1e6
+        "omega", "rad s-1", "Roll speed", "machine", "give the roll speed, such as '19 rpm'", ge=1e-6, le=1e6
     )
+    specific_pressing_force: Pascals | None = _field(
+        "F_sp", "Pa", "Pressing force over D L, held by the machine while the gap floats; the gap given is then only "
+        "where the nip angle is taken from a cake density", "machine",
+        "give the pressing force over diameter x width, such as '3.5 N/mm^2'", None, ge=1, le=1e12,
+    )  # fmt: skip
+    idle_torque: NewtonMetres = _field(
+        "T_0", "N m", "Torque of both drives that does not go into the bed", "machine (calibrated); 0: none",
+        "measure the drives with the rolls apart, such as '2 kN*m'", 0.0, ge=0, le=1e9,
+    )  # fmt: skip
 
     @classmethod
     def _impossible(cls, known: dict[str, Any]) -> Iterator[Fault]:
@@ -470,10 +486,12 @@ def _table_faults(table: tuple[tuple[float, float], ...], top_size: float | None
 
 
 class Flow(_Frozen):
-    """How the bed moves between the rolls (paper section 2.2; profile ours)."""
+    """How the bed moves between the rolls (paper section 2.2; profiles ours)."""
 
-    profile: Literal["power"] = Field(
-        "power", description="Speed along a streamline: 'power', |v| = U (1 - y/H)**exponent"
+    profile: Literal["power", "nip"] = Field(
+        "power",
+        description="Speed along a streamline: 'power', |v| = U (1 - y/H)**exponent (the paper's); "
+        "'nip', U below the nip and the feed's density above it (real machines)",
     )
     exponent: Number = _field(
         "m", "1", "Exponent of the speed profile; 1 is the paper's linear law", "paper section 2.2",
@@ -481,7 +499,48 @@ class Flow(_Frozen):
     )  # fmt: skip
     entry_fraction: Number = _field(
         "y_0/H", "1", "Depth of the first material point as a fraction of the bed's height (v = 0 at depth 0)",
-        "ours", "give a fraction such as 0.02", 0.02, gt=0, lt=1,
+        "ours", "give a fraction such as 0.02", 0.02, ge=1e-9, lt=1,
+    )  # fmt: skip
+    nip_angle: Radians | None = _field(
+        "alpha", "rad", "Nip angle of profile 'nip': where the rolls grip the bed", "machine and ore",
+        "give the nip angle, such as '9 deg'", None, ge=1e-3, lt=math.pi / 3,
+    )  # fmt: skip
+    cake_solid_fraction: Number | None = _field(
+        "phi_cake", "1", "Solid fraction of the pressed cake, from which the nip angle of profile 'nip' follows",
+        "Torres & Casali 2009", "give cake density over solid density, such as 0.85", None, gt=0, le=1,
+    )  # fmt: skip
+
+    @classmethod
+    def _impossible(cls, known: dict[str, Any]) -> Iterator[Fault]:
+        given = [name for name in ("nip_angle", "cake_solid_fraction") if known.get(name) is not None]
+        if known.get("profile") == "power":
+            for name in given:
+                yield Fault(
+                    name, f"{known[name]:g}", "profile 'power' has no nip", "leave it out, or take profile 'nip'"
+                )
+        if known.get("profile") == "nip" and len(given) != 1 and {"nip_angle", "cake_solid_fraction"} <= known.keys():
+            yield Fault("nip_angle", " and ".join(given) or "nothing", "profile 'nip' needs either nip_angle or "
+                        "cake_solid_fraction", "give one of them, such as cake_solid_fraction = 0.85")  # fmt: skip
+
+
+class RollWidth(_Frozen):
+    """How pressure falls from the middle of the roll width to its ends; not to be mistaken for across the gap.
+
+    The pressure at distance z from the middle is that of the middle times 1 - pressure_drop (2 z / L)**2
+    (model page, section Real machines).
+    """
+
+    pressure_drop: Number = _field(
+        "kappa", "1", "Part of the pressure that is lost at the ends of the rolls", "Torres & Casali 2009 (1); fitted",
+        "give a fraction such as 0.8", 0.8, ge=0, le=1,
+    )  # fmt: skip
+    edge_share: Number = _field(
+        "e", "1", "Part of the roll width whose product is called edge product", "Torres & Casali 2009",
+        "give a fraction such as 0.2", 0.2, gt=0, lt=1,
+    )  # fmt: skip
+    slices: Count = _field(
+        "N_z", "1", "Slices of the centre, and as many of the edge, that are crushed apart", "ours",
+        "give a whole number such as 4", 4, ge=1, le=1000,
     )  # fmt: skip
 
 
@@ -643,6 +702,7 @@ class Scene(_Frozen):
     flow: Flow = Field(Flow(), description="How the bed moves")
     stress: Stress = Field(Stress(), description="How the bed is loaded")
     exchange: Exchange | None = Field(None, description="Segregation and mixing; None switches both off")
+    roll_width: RollWidth | None = Field(None, description="Pressure along the roll width; None: the same all along")
     resolution: Resolution = Field(Resolution(), description="How finely, and what is kept")
     note: str = Field("", description="What a reader of the results should know, such as what is not calibrated")
 
@@ -655,6 +715,13 @@ class Scene(_Frozen):
                 yield Fault(f"feed.{name}", units.show(size, "m"),
                             f"must be at most the entry gap rolls.entry_gap {units.show(entry_gap, 'm')}",
                             "crush or scalp the feed first, or begin the bed higher")  # fmt: skip
+        yield from _nip_faults(known)
+        if known.get("roll_width.slices") and known.get("exchange.interval"):
+            yield Fault("roll_width", "slices", "exchange between streamlines is not simulated slice by slice",
+                        "leave roll_width or exchange out")  # fmt: skip
+        if known.get("roll_width.slices") and known.get("resolution.record", "product") != "product":
+            yield Fault("resolution.record", repr(known["resolution.record"]), "roll_width keeps the product only",
+                        "take record = 'product', or leave roll_width out")  # fmt: skip
         table, top_size = known.get("feed.table"), known.get("feed.top_size")
         coarsest = next((size for size, percent in table or () if percent >= 100), 0.0)
         if entry_gap is not None and top_size is None and coarsest > entry_gap:
@@ -729,6 +796,36 @@ class Scene(_Frozen):
     __str__ = __repr__
 
 
+def _nip_faults(known: dict[str, Any]) -> Iterator[Fault]:
+    """Yield what keeps the nip from lying in the bed."""
+    cake, feed = known.get("flow.cake_solid_fraction"), known.get("material.feed_solid_fraction")
+    gap, entry_gap, diameter = (known.get(f"rolls.{name}") for name in ("gap", "entry_gap", "diameter"))
+    limit = known.get("material.max_solid_fraction")
+    if cake is not None and feed is not None and limit is not None and not feed <= cake <= limit:
+        yield Fault("flow.cake_solid_fraction", f"{cake:g}",
+                    f"must lie within feed_solid_fraction {feed:g} to max_solid_fraction {limit:g}",
+                    "rolls compact the feed, and no further than that")  # fmt: skip
+        return
+    if None in (gap, entry_gap, diameter):
+        return
+    angle = known.get("flow.nip_angle")
+    if cake is not None and feed is not None:
+        room = (gap + diameter) ** 2 - 4 * gap * diameter * cake / feed
+        if room < 0:
+            densest = feed * (gap + diameter) ** 2 / (4 * gap * diameter)
+            yield Fault("flow.cake_solid_fraction", f"{cake:g}",
+                        f"no nip angle feeds so dense a cake; must be at most {densest:.3g}",
+                        "give a lighter cake or a narrower gap")  # fmt: skip
+            return
+        angle = math.acos(min((gap + diameter + math.sqrt(room)) / (2 * diameter), 1.0))
+    if angle is not None and known.get("rolls.specific_pressing_force") is None and gap < entry_gap:
+        nip = gap + diameter * (1 - math.cos(angle))
+        if nip > entry_gap:
+            yield Fault("rolls.entry_gap", units.show(entry_gap, "m"),
+                        f"must be at least {units.show(nip, 'm')}, the roll distance at the nip angle "
+                        f"{units.show(angle, 'rad')}", "begin the bed higher")  # fmt: skip
+
+
 def faults_of(error: ValidationError, separator: str = "; ") -> str:
     """Return the faults of a refused scene as text, each with its field."""
     return separator.join(f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in error.errors())
@@ -770,9 +867,9 @@ def field_value(name: str, value: Any) -> Any:
     ValueError
         If a scene has no such field, or the field refuses the value.
     """
-    part, field = _find_field(name)
+    part, _ = _find_field(name)
     try:
-        return _valid_alone(field, value)
+        return _valid_alone(part, name.rpartition(".")[2], value)
     except ValidationError as error:
         fault = error.errors(include_url=False)[0] | {"loc": (name.rpartition(".")[2],)}
         raise ValueError(f"{name}: {_explained(part, fault)['type'].message()}") from None

@@ -28,6 +28,9 @@ COORDINATES = {
     "height": Variable(_POINT, "m", "height above the minimum gap", np.float64),
     "residence_time": Variable(_POINT, "s", "time since the first material point", np.float64),
     "sieve": Variable(("sieve",), "m", "sieve size", np.float64),
+    "width_position": Variable(
+        ("slice",), "1", "distance from the middle of the roll width over half of it", np.float64
+    ),
 }
 
 VARIABLES = {
@@ -39,11 +42,21 @@ VARIABLES = {
     "volumetric_strain_rate": Variable(_POINT, "s-1", "volumetric strain rate, compaction positive"),
     "shear_strain_rate": Variable(_POINT, "s-1", "triaxial shear strain rate"),
     "volumetric_strain": Variable(_POINT, "1", "volumetric strain since the onset of compaction"),
+    "shear_strain": Variable(_POINT, "1", "elastic triaxial shear strain since the onset of compaction"),
     "solid_fraction": Variable(_POINT, "1", "solid fraction"),
     "pressure": Variable(_POINT, "Pa", "mean stress p, compression positive"),
     "shear_stress": Variable(_POINT, "Pa", "triaxial shear stress q"),
     "on_shear_limit": Variable(_POINT, "1", "whether shear beyond the convexity limit was taken as plastic", np.int8),
     "throughput": Variable((), "kg s-1", "solids through the whole gap"),
+    "pressing_force": Variable((), "N", "force that presses the rolls on the bed"),
+    "specific_pressing_force": Variable((), "Pa", "pressing force over roll diameter times width"),
+    "torque": Variable((), "N m", "torque of both drives"),
+    "power": Variable((), "W", "power of both drives"),
+    "specific_energy": Variable((), "J kg-1", "power over throughput"),
+    "specific_throughput": Variable((), "kg m-3", "throughput over roll diameter, width and surface speed"),
+    "nip_angle": Variable((), "rad", "roll angle above the minimum gap at which compaction begins"),
+    "force_angle": Variable((), "rad", "angle at which the pressing force would take the bed's power"),
+    "operating_gap": Variable((), "m", "gap that carries the pressing force"),
     "peak_pressure": Variable((), "Pa", "largest mean stress in the bed"),
     "peak_pressure_height": Variable((), "m", "height of the largest mean stress above the minimum gap"),
     "streamline_peak_pressure": Variable(("streamline",), "Pa", "largest mean stress on the streamline"),
@@ -58,6 +71,13 @@ VARIABLES = {
     "p80": Variable(("streamline",), "m", "product size that 80 % of the mass passes"),
     "p50_total": Variable((), "m", "product size that 50 % of the mass passes, whole gap"),
     "p80_total": Variable((), "m", "product size that 80 % of the mass passes, whole gap"),
+    "passing_slice": Variable(("slice", "sieve"), "1", "mass fraction of the product of a slice of the width passing"),
+    "passing_width_centre": Variable(("sieve",), "1", "mass fraction of the product passing, centre of the roll width"),
+    "passing_width_edge": Variable(("sieve",), "1", "mass fraction of the product passing, edge of the roll width"),
+    "p50_width_centre": Variable((), "m", "product size that 50 % of the mass passes, centre of the roll width"),
+    "p80_width_centre": Variable((), "m", "product size that 80 % of the mass passes, centre of the roll width"),
+    "p50_width_edge": Variable((), "m", "product size that 50 % of the mass passes, edge of the roll width"),
+    "p80_width_edge": Variable((), "m", "product size that 80 % of the mass passes, edge of the roll width"),
     "breaks_per_cell": Variable(("streamline",), "1", "mean number of breaks of a cell"),
     "below_floor": Variable(("streamline",), "1", "fraction of the product below the size floor, where nothing breaks"),
     "volume": Variable(_POINT, "m2", "area of the Voronoi cell of the material point, volume per roll width"),
@@ -82,6 +102,9 @@ FLAGS = {
     "size_floor_reached": 16,
     "few_cells": 32,
     "tension_clamped": 64,
+    "unusual_machine": 128,
+    "no_force_angle": 256,
+    "no_limit_of_steps": 512,
 }
 
 

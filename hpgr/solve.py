@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hpgr import kernels, limits, parcels
+from hpgr import kernels, limits, parcels, width
 from hpgr.exchange import SwapRates
 from hpgr.lattice import Lattice
 from hpgr.scene import Scene
@@ -40,6 +40,26 @@ class Exchanged(NamedTuple):
     swaps_per_cell: float
 
 
+class AlongWidth(NamedTuple):
+    """Product along the roll width.
+
+    Attributes
+    ----------
+    passing : ndarray
+        (slice, sieve) mass fraction of the product of each slice passing each sieve.
+    centre_passing, edge_passing : ndarray
+        (sieve,) of the product called centre and edge.
+    centre_percentiles, edge_percentiles : ndarray
+        (2,) P50 and P80 of these, m.
+    """
+
+    passing: np.ndarray
+    centre_passing: np.ndarray
+    edge_passing: np.ndarray
+    centre_percentiles: np.ndarray
+    edge_percentiles: np.ndarray
+
+
 class Crushed(NamedTuple):
     """What crushing left behind; what was not asked for is None.
 
@@ -59,6 +79,8 @@ class Crushed(NamedTuple):
         (time, streamline, point, sieve) mass fraction between each sieve and the next finer one.
     exchanged : Exchanged
         What only a scene with exchange has.
+    along_width : AlongWidth
+        What only a scene with a roll width has; all else is then combined over the width.
     """
 
     breaks: np.ndarray
@@ -69,6 +91,7 @@ class Crushed(NamedTuple):
     size: np.ndarray | None = None
     mass_fraction: np.ndarray | None = None
     exchanged: Exchanged | None = None
+    along_width: AlongWidth | None = None
 
 
 FRACTIONS = (0.5, 0.8)  # of the percentiles every product is summarised by
@@ -117,42 +140,67 @@ def crush(
 
 
 def _closed_form(scene: Scene, log_stress: np.ndarray) -> Crushed:
-    ore, grid = scene.material, scene.resolution
-    critical = limits.critical_size(np.maximum.accumulate(log_stress, axis=1), ore)
-    at_exit = critical[:, -1]
+    ore, grid, slices = scene.material, scene.resolution, width.slices_of(scene)
+    highest = np.maximum.accumulate(log_stress, axis=1)
+    # (slice, streamline): a stream tube of each slice leaves with the product of its own critical size
+    at_exit = limits.critical_size(highest[:, -1] + np.log(slices.pressure)[:, None], ore)
     sieves = np.array(grid.sieves)
 
-    def passing(size):
-        return limits.crushed_passing(scene.feed, size, at_exit, ore.fragment_exponent)
+    def passing(size, share=slices.share):  # size (..., streamline)
+        each = limits.crushed_passing(scene.feed, size[..., None, :], at_exit, ore.fragment_exponent)
+        return np.einsum("s,...sn->...n", share, each)
 
-    def total_passing(size):
-        return passing(size).mean(axis=1, keepdims=True)
+    def total_passing(size, share=slices.share):
+        return passing(size, share).mean(axis=-1, keepdims=True)
 
     coarsest, fractions = scene.feed.coarsest, np.array(FRACTIONS)[:, None]
     mass = None
     if grid.record == "distributions":
+        critical = limits.critical_size(highest, ore)
         everywhere = limits.crushed_passing(scene.feed, sieves, critical[..., None], ore.fragment_exponent)
         mass = np.diff(everywhere, axis=-1, prepend=0.0)[None]
     return Crushed(
-        breaks=limits.expected_breaks(scene.feed, at_exit, ore.fragment_exponent),
-        below_floor=passing(np.nextafter(ore.size_floor, 0.0)),
-        passing=limits.crushed_passing(scene.feed, sieves, at_exit[:, None], ore.fragment_exponent),
-        percentiles=limits.percentile(passing, np.tile(fractions, at_exit.size), coarsest),
+        breaks=slices.share @ limits.expected_breaks(scene.feed, at_exit, ore.fragment_exponent),
+        below_floor=passing(np.full(at_exit.shape[1], np.nextafter(ore.size_floor, 0.0))),
+        passing=passing(np.tile(sieves[:, None], at_exit.shape[1])).T,
+        percentiles=limits.percentile(passing, np.tile(fractions, at_exit.shape[1]), coarsest),
         total_percentiles=limits.percentile(total_passing, fractions, coarsest)[:, 0],
         mass_fraction=mass,
+        along_width=None if scene.roll_width is None else _closed_along_width(slices, total_passing, sieves, scene),
     )
+
+
+def _closed_along_width(slices: width.Slices, total_passing, sieves: np.ndarray, scene: Scene) -> AlongWidth:
+    fractions, each = np.array(FRACTIONS)[:, None], np.eye(slices.share.size)
+    zones = [_zone(slices, at_edge) for at_edge in (False, True)]
+    return AlongWidth(
+        np.array([total_passing(sieves[:, None], one)[:, 0] for one in each]),
+        *(total_passing(sieves[:, None], zone)[:, 0] for zone in zones),
+        *(
+            limits.percentile(lambda size, zone=zone: total_passing(size, zone), fractions, scene.feed.coarsest)[:, 0]
+            for zone in zones
+        ),
+    )
+
+
+def _zone(slices: width.Slices, at_edge: bool) -> np.ndarray:
+    """Return the shares of the slices in the centre or edge product, 0 outside it."""
+    share = np.where(slices.at_edge == at_edge, slices.share, 0.0)
+    return share / share.sum()
 
 
 def _march(scene: Scene, log_stress: np.ndarray, seed: int, replicate: int) -> Crushed:
     """March one parcel per streamline and photograph; each is keyed, so their order does not matter."""
-    grid = scene.resolution
+    grid, slices, tubes = scene.resolution, width.slices_of(scene), log_stress.shape[0]
+    # every slice marches the same parcels under its own pressure, so that slices differ by that alone
+    log_stress = (log_stress + np.log(slices.pressure)[:, None, None]).reshape(-1, log_stress.shape[1])
     shape = (grid.photographs, *log_stress.shape)
     product = np.empty((*shape[:2], grid.cells), np.float32)
     size = np.empty((*shape, grid.cells), np.float32) if grid.record == "cells" else None
     sieves = _cell_sieves(scene) if grid.record == "distributions" else _NO_SIEVES
     classes = np.empty((*shape, sieves.size + 1), np.int64) if sieves.size else None
     columns = list(np.ndindex(*shape[:2]))
-    keys = [(replicate, line, photograph) for photograph, line in columns]
+    keys = [(replicate, line % tubes, photograph) for photograph, line in columns]
     lines, counts = np.array([line for _, line in columns]), np.empty(len(columns), np.int64)
     reach_needed = parcels.reach_needed(scene, log_stress)
     cells = product.reshape(len(columns), -1)
@@ -217,29 +265,50 @@ def _run_lattice(scene, log_stress, time_step, rates, seed, replicate) -> Crushe
 
 
 def _summarised(scene, product, breaks, size, classes) -> Crushed:
-    """Sum up the product (photograph, streamline, cell), photographs pooled; breaks come as their total."""
+    """Sum up the product (photograph, slice x streamline, cell), photographs pooled; breaks come as their total."""
+    slices = width.slices_of(scene)
     pooled = np.sort(product.transpose(1, 0, 2).reshape(product.shape[1], -1), axis=1)
     below_floor = np.nextafter(scene.material.size_floor, 0.0)
     passing = np.empty((pooled.shape[0], 1 + len(scene.resolution.sieves)), np.int64)
     kernels.passing_counts(pooled, np.append(below_floor, _cell_sieves(scene)), passing)
+    # (slice, streamline, ...)
+    breaks, passing, pooled = (
+        part.reshape(slices.share.size, -1, *part.shape[1:]) for part in (breaks, passing, pooled)
+    )
+    passing, breaks = passing / pooled.shape[-1], breaks / pooled.shape[-1]
+    combined = np.tensordot(slices.share, passing, axes=1)
     return Crushed(
-        breaks=breaks / pooled.shape[1],
-        below_floor=passing[:, 0] / pooled.shape[1],
-        passing=passing[:, 1:] / pooled.shape[1],
-        percentiles=_percentiles(pooled),
-        total_percentiles=_percentiles(np.sort(pooled, axis=None)),
+        breaks=slices.share @ breaks,
+        below_floor=combined[:, 0],
+        passing=combined[:, 1:],
+        percentiles=np.stack([_percentiles(pooled[:, line], slices.share) for line in range(pooled.shape[1])], axis=-1),
+        total_percentiles=_percentiles(pooled, slices.share),
         size=size,
         mass_fraction=None if classes is None else classes[..., :-1] / scene.resolution.cells,
+        along_width=None if scene.roll_width is None else _along_width(slices, passing[..., 1:], pooled),
     )
 
 
-def _percentiles(pooled: np.ndarray) -> np.ndarray:
-    """Return the percentiles (fraction, ...) of sorted cells (..., cell), linear between cells as np.quantile's are."""
-    place = np.array(FRACTIONS) * (pooled.shape[-1] - 1)
+def _along_width(slices: width.Slices, passing: np.ndarray, pooled: np.ndarray) -> AlongWidth:
+    each = passing.mean(axis=1)
+    zones = [_zone(slices, at_edge) for at_edge in (False, True)]
+    return AlongWidth(each, *(zone @ each for zone in zones), *(_percentiles(pooled, zone) for zone in zones))
+
+
+def _percentiles(cells: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Return the percentiles (fraction,) of sorted rows of cells (slice, ..., cell), each slice with its share of mass.
+
+    Of one slice linear between cells as np.quantile's are; of several the first size that reaches the fraction.
+    """
+    if share.size > 1:
+        weights = np.broadcast_to(share.reshape(-1, *(1,) * (cells.ndim - 1)), cells.shape)
+        return np.quantile(cells, FRACTIONS, weights=weights, method="inverted_cdf").astype(float)
+    ordered = cells.ravel() if cells.size == cells.shape[-1] else np.sort(cells, axis=None)
+    place = np.array(FRACTIONS) * (ordered.size - 1)
     before = place.astype(int)
-    after = np.minimum(before + 1, pooled.shape[-1] - 1)
-    low, high = (pooled[..., k].astype(float) for k in (before, after))
-    return np.moveaxis(low + (high - low) * (place - before), -1, 0)
+    after = np.minimum(before + 1, ordered.size - 1)
+    low, high = (ordered[k].astype(float) for k in (before, after))
+    return low + (high - low) * (place - before)
 
 
 def _cell_sieves(scene: Scene) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hpgr.flow import Motion
+from hpgr.flow import Motion, running_sum
 from hpgr.scene import Material, Scene
 
 _TENSION_NOISE = 1e-9  # of the peak pressure; less is rounding of the running sum
@@ -21,8 +21,8 @@ class Load(NamedTuple):
 
     Attributes
     ----------
-    volumetric_strain : ndarray
-        Strain since the onset of compaction.
+    volumetric_strain, shear_strain : ndarray
+        Volumetric and elastic triaxial shear strain since the onset of compaction.
     solid_fraction : ndarray
         Solid fraction, at most the material's maximum.
     pressure, shear_stress : ndarray
@@ -32,10 +32,11 @@ class Load(NamedTuple):
     continuity_solid_fraction : ndarray
         (streamline,) solid fraction that mass continuity would need at the exit; may exceed 1.
     tension_clamped : bool
-        Whether the law asked for tension somewhere and got zero pressure.
+        Whether the law asked for tension, or for shear against the flow, somewhere: stresses are held at 0 then.
     """
 
     volumetric_strain: np.ndarray
+    shear_strain: np.ndarray
     solid_fraction: np.ndarray
     pressure: np.ndarray
     shear_stress: np.ndarray
@@ -71,10 +72,9 @@ def load(scene: Scene, motion: Motion) -> Load:
 
     `motion` holds `scene.stress.substeps` steps per time step; the result has its points.
     """
-    material, step = scene.material, motion.time_step
-    compacting = np.cumsum(motion.volumetric_rate > 0, axis=1) > 0  # from the first compaction on
-    d_eps_v = _trapezoid(motion.volumetric_rate, compacting, step)
-    d_eps_s = _trapezoid(motion.shear_rate, compacting, step)
+    material = scene.material
+    compacting = _compacting(motion)
+    d_eps_v, d_eps_s = strain_increments(motion)
     eps_v, _ = _sum_above_zero(d_eps_v)
     eps_s, limited = _sum_below(d_eps_s, eps_v, largest_shear_ratio(material))
     phi = np.minimum(material.feed_solid_fraction * np.exp(eps_v), material.max_solid_fraction)
@@ -85,15 +85,21 @@ def load(scene: Scene, motion: Motion) -> Load:
     else:
         d_p, d_q = _euler_increments(material, motion, compacting, eps_v, eps_s, phi)
     pressure, tension = _sum_above_zero(d_p)
-    shear_stress, _ = _sum_above_zero(d_q)
+    shear_stress, reversal = _sum_above_zero(d_q)
     return Load(
         volumetric_strain=eps_v,
+        shear_strain=eps_s,
         solid_fraction=phi,
         pressure=pressure,
         shear_stress=shear_stress,
         on_shear_limit=limited,
         continuity_solid_fraction=material.feed_solid_fraction * np.exp(eps_v[:, -1]),
-        tension_clamped=bool(tension > _TENSION_NOISE * pressure.max(initial=0.0)),
+        tension_clamped=(
+            tension > _TENSION_NOISE * pressure.max(initial=0.0)
+            or reversal > _TENSION_NOISE * shear_stress.max(initial=0.0)
+            # explicit steps from zero strain miss what the state functions say there; they do so for c < 0 only
+            or bool((state_pressure(eps_v, eps_s, material) < 0).any())
+        ),
     )
 
 
@@ -120,14 +126,31 @@ def _euler_increments(material, motion, compacting, eps_v, eps_s, phi):
     return d_p, d_q
 
 
-def _trapezoid(rate, compacting, step):
-    """Return the increments (streamline, point - 1) of a rate between points past the onset."""
-    return np.where(compacting[:, :-1], (rate[:, 1:] + rate[:, :-1]) * (step / 2), 0.0)
+def strain_increments(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """Return the increments (streamline, point - 1) of volumetric and shear strain past the onset of compaction.
+
+    By the trapezoid rule between points; of the step with the nip only what lies past it counts.
+    """
+    past = np.where(_compacting(motion)[:, :-1], motion.time_step / 2, 0.0)
+    starts = motion.volumetric_rate[:, :-1], motion.shear_rate[:, :-1]
+    if motion.onset is not None:
+        past = motion.onset.fraction * (motion.time_step / 2)
+        within = motion.onset.fraction < 1
+        at_nip = motion.onset.volumetric_rate, motion.onset.shear_rate
+        starts = (np.where(within, nip, start) for nip, start in zip(at_nip, starts, strict=True))
+    ends = motion.volumetric_rate[:, 1:], motion.shear_rate[:, 1:]
+    volumetric, shear = ((end + start) * past for end, start in zip(ends, starts, strict=True))
+    return volumetric, shear
+
+
+def _compacting(motion: Motion) -> np.ndarray:
+    """Return where (streamline, point) compaction has begun."""
+    return np.cumsum(motion.volumetric_rate > 0, axis=1) > 0
 
 
 def _sum_above_zero(increments):
     """Return the running sums from 0 that are held at zero when they would fall below, and by how much."""
-    total = np.cumsum(np.pad(increments, ((0, 0), (1, 0))), axis=1)
+    total = running_sum(increments)
     lowest = np.minimum.accumulate(total, axis=1)
     return total - lowest, -float(lowest.min())
 
@@ -137,12 +160,13 @@ def _sum_below(increments, eps_v, ratio):
 
     min(s + d, limit) at every step is D + running minimum of (limit - D), D the plain sum.
     """
-    total = np.cumsum(np.pad(increments, ((0, 0), (1, 0))), axis=1)
+    total = running_sum(increments)
     if math.isinf(ratio):
         return total, np.zeros(total.shape, dtype=bool)
     room = ratio * eps_v - total
     lowest = np.minimum.accumulate(np.minimum(room, 0.0), axis=1)
-    return np.maximum(total + lowest, 0.0), (room <= lowest) & (eps_v > 0)
+    # where the limit is tiny beside the plain sum, rounding would carry their difference past it
+    return np.clip(total + lowest, 0.0, ratio * eps_v), (room <= lowest) & (eps_v > 0)
 
 
 def _ratio(eps_s, eps_v):

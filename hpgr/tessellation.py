@@ -66,13 +66,13 @@ def tessellate(scene: Scene, geometry: Geometry, motion: Motion) -> Tessellation
         length = _length_within(domain, ends)
         cells = _clipped(domain, whole)
     except shapely.errors.GEOSException as error:  # how the library tells of points that it cannot tell apart
-        raise ValueError(_lost(str(error))) from None
+        raise ValueError(_lost(str(error), len(points))) from None
     kept = length > 0
     pairs, length = pairs[kept], length[kept]
     volume = shapely.area(cells)
     excess = abs(volume.sum() / domain.area - 1)
     if not excess <= _CLOSED or not (volume > 0).all():
-        raise ValueError(_lost(f"the cells miss the bed's area by {excess:.1e}"))
+        raise ValueError(_lost(f"the cells miss the bed's area by {excess:.1e}", len(points)))
     step = points[pairs[:, 1]] - points[pairs[:, 0]]
     upward = step[:, 1] < 0
     pairs[upward] = pairs[upward, ::-1]
@@ -98,7 +98,7 @@ def _voronoi(points: np.ndarray, domain: shapely.Polygon) -> np.ndarray:
     around = domain.buffer(0.1 * domain.length)
     cells = shapely.get_parts(shapely.voronoi_polygons(shapely.multipoints(points), extend_to=around, ordered=True))
     if cells.size != len(points):
-        raise ValueError(_lost(f"{len(points) - cells.size} of {len(points)} points have no cell"))
+        raise ValueError(_lost(f"{len(points) - cells.size} of {len(points)} points have no cell", len(points)))
     return cells
 
 
@@ -135,8 +135,9 @@ def _clipped(domain: shapely.Polygon, cells: np.ndarray) -> np.ndarray:
     return cells
 
 
-def _lost(what: str) -> str:
+def _lost(what: str, points: int) -> str:
     return (
-        f"tessellation: {what}; the material points lie too close together for double precision; "
+        f"resolution.points: got {points} points on all streamlines; tessellation: {what}; "
+        "the material points lie too close together for double precision; "
         "use fewer streamlines or points, or a larger flow.entry_fraction"
     )

@@ -8,12 +8,24 @@ SHOWN = {
     "m": ("mm", 1e3),
     "Pa": ("MPa", 1e-6),
     "rad s-1": ("rpm", 60 / (2 * 3.141592653589793)),
+    "rad": ("deg", 180 / 3.141592653589793),
     "kg s-1": ("t/h", 3.6),
+    "N": ("kN", 1e-3),
+    "N m": ("kN m", 1e-3),
+    "W": ("kW", 1e-3),
+    "J kg-1": ("kWh/t", 1 / 3600),
 }
 
 # pint's spelling of the CF-style units that fields carry
-_PINT = {"rad s-1": "rad/s", "kg m-3": "kg/m^3", "m": "m", "Pa": "Pa"}
-_EXAMPLES = {"rad s-1": "19 rpm", "kg m-3": "2.7 g/cm^3", "m": "60 mm", "Pa": "0.84 MPa"}
+_PINT = {"rad s-1": "rad/s", "kg m-3": "kg/m^3", "m": "m", "Pa": "Pa", "rad": "rad", "N m": "N*m"}
+_EXAMPLES = {
+    "rad s-1": "19 rpm",
+    "kg m-3": "2.7 g/cm^3",
+    "m": "60 mm",
+    "Pa": "0.84 MPa",
+    "rad": "9 deg",
+    "N m": "2 kN*m",
+}
 
 # stricter than pint, which reads past what it does not understand ("60; mm") and sums up ("60 mm + 1 m")
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|[+-]?(?:nan|inf)(?=\s)"

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import ValidationError
 
 import hpgr
-from hpgr import budget, pipeline, schema, solve
+from hpgr import budget, machine, pipeline, schema, solve
 from hpgr import tolerance as tolerances
 from hpgr.scene import Scene, faults_of, level_text
 
@@ -87,10 +87,10 @@ class Bench:
         """Return the variables of a case by name, as `hpgr.simulate` would."""
         job = self.job
         if case.values != self._values:
-            self.scene, self._values = job.base.with_values(case.values), None
+            self.scene, self._values = machine.at_operating_gap(job.base.with_values(case.values)), None
             if job.tolerance is not None:
                 estimate = tolerances.refine(self.scene, job.tolerance, job.max_cost, job.seed)
-                self.scene, self._chosen = estimate.scene, estimate.variables()
+                self.scene, self._chosen = machine.at_operating_gap(estimate.scene), estimate.variables()
             budget.refuse_too_large(self.scene, self._room)
             self._values = case.values  # now only: a refused scene must not be taken for the next replicate's
         key = pipeline.bed_key(self.scene)

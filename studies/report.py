@@ -30,12 +30,12 @@ def percent_passing(result: xr.Dataset, sieve: float, total: bool = True) -> xr.
     return found
 
 
-_READ = ("throughput", "p50_total", "p80_total", "passing_total", "peak_pressure")
+READ = ("throughput", "p50_total", "p80_total", "passing_total", "peak_pressure")
 
 
 def figures(result: xr.Dataset, sieve: float) -> dict[str, xr.DataArray]:
     """Return the figures a study is read by, by heading, in the units people use."""
-    result = result[[name for name in _READ if name in result]].astype(float)
+    result = result[[name for name in READ if name in result]].astype(float)
     found = {"throughput [t/h]": result["throughput"] * 3.6}
     if "p80_total" in result:
         found["P50 [mm]"] = result["p50_total"] * 1e3
@@ -43,6 +43,26 @@ def figures(result: xr.Dataset, sieve: float) -> dict[str, xr.DataArray]:
         found[f"below {units.show(sieve, 'm')} [%]"] = percent_passing(result, sieve)
     found["peak pressure [MPa]"] = result["peak_pressure"] * 1e-6
     return found
+
+
+_MACHINE = {  # variable -> heading, how many of its unit make one SI unit
+    "operating_gap": ("gap [mm]", 1e3),
+    "specific_pressing_force": ("Fsp [N/mm²]", 1e-6),
+    "pressing_force": ("force [kN]", 1e-3),
+    "torque": ("torque [kN m]", 1e-3),
+    "power": ("power [kW]", 1e-3),
+    "specific_energy": ("W [kWh/t]", 1 / 3600),
+    "specific_throughput": ("mdot [t s/(h m³)]", 3.6),
+    "nip_angle": ("nip [deg]", 180 / np.pi),
+    "force_angle": ("beta [deg]", 180 / np.pi),
+}
+
+
+def machine_figures(result: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Return force, power and their like, by heading, in the units people use."""
+    return {
+        heading: result[name].astype(float) * factor for name, (heading, factor) in _MACHINE.items() if name in result
+    }
 
 
 def spread(values: xr.DataArray) -> xr.DataArray:
@@ -58,16 +78,22 @@ def table(result: xr.Dataset, sieve: float) -> str:
     if not any_result(result):
         return "no case holds a result"
     points = operating_points(result)
+    tables = [_columns(result, points, found) for found in (figures(points, sieve), machine_figures(points)) if found]
+    lines = [line for part in tables for line in (*part, "")][:-1]
+    if result.sizes["replicate"] > 1:
+        lines.append(f"(mean ± standard deviation of {result.sizes['replicate']} replicates)")
+    return "\n".join(lines)
+
+
+def _columns(result: xr.Dataset, points: xr.Dataset, found: dict[str, xr.DataArray]) -> list[str]:
+    """Return the lines of a table: the axes, then each figure."""
     columns = {axis_label(points[name]): _axis_texts(points[name]) for name in axes_of(result)}
-    for heading, values in figures(points, sieve).items():
+    for heading, values in found.items():
         means, spreads = values.mean("replicate").values, spread(values).values
         columns[heading] = [_figure(mean, deviation) for mean, deviation in zip(means, spreads, strict=True)]
     widths = [max(map(len, (heading, *texts))) for heading, texts in columns.items()]
     rows = [columns, *zip(*columns.values(), strict=True)]
-    lines = ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)) for row in rows]
-    if result.sizes["replicate"] > 1:
-        lines.append(f"(mean ± standard deviation of {result.sizes['replicate']} replicates)")
-    return "\n".join(lines)
+    return ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)) for row in rows]
 
 
 def notes(result: xr.Dataset) -> list[str]:

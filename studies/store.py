@@ -55,11 +55,16 @@ _HARMLESS_FILTERS = {1: "deflate", 2: "shuffle", 3: "fletcher32", 4: "szip", 5: 
 def write_dataset(dataset: xr.Dataset, path: str | Path) -> None:
     """Write `dataset` as compressed, checksummed NetCDF; the file at `path` is replaced whole or not at all.
 
+    In the file the dimension `time` is called `photograph`: it counts photographs, and CF keeps the other name for
+    times since a date.
+
     Raises
     ------
     OSError
         If it cannot be written; a file that stood at `path` before is left as it was.
     """
+    if "time" in dataset.dims:
+        dataset = dataset.rename(time="photograph")
     encoding = {name: _encoding(variable) for name, variable in dataset.variables.items()}
 
     def write(part: Path) -> None:

@@ -355,7 +355,7 @@ def _assemble(job: Job, grid, replicates: int, outcomes: Iterable[Outcome], plan
         info = field_info(name)
         attrs = {"units": info.unit, "long_name": info.text, "scene_field": name}
         dataset.coords[dim_of(name)] = (dim_of(name), np.array(values), attrs if info.unit else {})
-    attrs = {"units": "1", "long_name": "independent repetition"}
+    attrs = {"units": "1", "long_name": "independent repetition", "standard_name": "realization"}
     dataset.coords["replicate"] = ("replicate", np.arange(replicates, dtype=np.int32), attrs)
     for name in (name for name in schema.COORDINATES if name in along and name not in uneven):
         dataset.coords[name] = (schema.COORDINATES[name].dims, along[name], schema.attributes(name))

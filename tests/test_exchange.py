@@ -175,7 +175,7 @@ def test_segregation_counts_with_the_largest_grain_below_and_dust_above():
 
 def test_absurd_exchange_is_refused_with_its_cost():
     scene = mixed({"resolution.streamlines": 40, "resolution.points": 200, "resolution.cells": 2})
-    with pytest.raises(ValueError, match=r"exchange: .*mixing 100 need .* passes per time step") as refused:
+    with pytest.raises(ValueError, match=r"exchange: .*mixing 100; they need .* passes per time step") as refused:
         simulate(scene.with_values({"exchange.mixing": 100}))
     for part in ("must be at most 1,000", "predicted cost above", " s; use fewer points"):
         assert part in str(refused.value)
@@ -188,7 +188,9 @@ def test_absurd_segregation_is_refused_too(monkeypatch):
     needed = int(simulate(scene)["exchange_passes"])
     assert needed > 20
     monkeypatch.setattr(exchange, "MOST_PASSES", needed // 2)
-    with pytest.raises(ValueError, match=rf"exchange: segregation 100 .* passes .* at most {needed // 2:,}; predicted"):
+    with pytest.raises(
+        ValueError, match=rf"exchange: got segregation 100 .* passes .* at most {needed // 2:,}; predicted"
+    ):
         simulate(scene)
 
 

@@ -179,3 +179,10 @@ def test_scalping_outside_the_table_is_refused():
     for top in (0.0009, 0.009):
         with pytest.raises(ValueError, match="must lie within the table, above 1 mm to 8 mm"):
             Feed(kind="table", table=TABLE, top_size=top)
+
+
+def test_a_steep_rosin_rammler_feed_far_finer_than_its_top_overflows_in_silence():
+    """(s / size) ** exponent is inf there, and all of it passes."""
+    steep = Feed(kind="rosin_rammler", size=1e-5, exponent=100.0, top_size=0.04)
+    assert feed.passing(steep, [0.0, 0.04]).tolist() == [0.0, 1.0]
+    assert feed.quantile(steep, [0.5]) == pytest.approx(1e-5 * math.log(2) ** 0.01, rel=1e-12)

@@ -114,3 +114,8 @@ def test_expected_breaks_of_one_size():
     """A2: 1 + gamma ln(s0 / s_c), exactly."""
     found = limits.expected_breaks(FEEDS["single"], np.array([0.06 / math.e, 0.006, 0.1]), 2.0)
     assert found == pytest.approx([3.0, 1 + 2 * math.log(10), 0.0], rel=1e-12)
+
+
+def test_far_above_the_critical_size_a_steep_exponent_overflows_in_silence():
+    found = limits.crushed_passing(FEEDS["uniform"], np.array([1e-9, 0.01]), 1e-8, 1e6)
+    assert found.tolist() == [0.0, 1.0]

@@ -1,3 +1,6 @@
+import math
+from importlib.resources import files
+
 import pytest
 
 from hpgr import Feed, presets, tables
@@ -81,3 +84,153 @@ def test_shipped_table_is_the_published_one():
     assert len(table) == 13
     assert table[0] == (pytest.approx(0.125e-3), 2.58)
     assert table[-1] == (pytest.approx(45e-3), 100.0)
+
+
+PRODUCT = "test,size_mm,feed,centre,edge,total\nA,4,100,100,100,100\nA,1,10,40,20,35\nA,2,50,,60,70\n"
+OPERATIONS = "test,U_m_s,Fsp_N_mm2,P_kW,Q_tph\nA,0.5,2.5,36,18\n"
+
+
+def read_tests(tmp_path, product=PRODUCT, operations=OPERATIONS):
+    return tables.read_pilot_tests(write(tmp_path / "p.csv", product), write(tmp_path / "o.csv", operations))
+
+
+def refused(tmp_path, product=PRODUCT, operations=OPERATIONS):
+    """Return the faults, one a line."""
+    with pytest.raises(ValueError, match="pilot tests") as error:
+        read_tests(tmp_path, product, operations)
+    count, *faults = str(error.value).splitlines()
+    assert count.startswith(f"{len(faults)} fault")
+    return faults
+
+
+def test_shipped_pilot_tests_are_the_published_ones():
+    data = files("hpgr") / "data"
+    tests = tables.read_pilot_tests(data / "khd_porphyry_psd.csv", data / "khd_porphyry_operations.csv")
+    assert [test.name for test in tests] == ["K-P1", "K-P2", "K-P3", "K-P4", "K-P5"]
+    assert {len(test.sizes) for test in tests} == {13}
+    fourth = tests[3]
+    assert fourth[1:11] == pytest.approx(
+        (0.97, 3.7e6, 0.0167, 0.0217, 43.8e3 / 3600, 227e3 / 3600, 89.6e3, 2.04 * 3600, 60e5, 0.035)
+    )
+    assert fourth.sizes[[0, -1]] == pytest.approx([0.125e-3, 45e-3])
+    for array, percent in zip(fourth[-4:], (5.16, 27.81, 9.76, 24.76), strict=True):
+        assert array[[3, -1]] == pytest.approx([percent / 100, 1.0])
+
+
+def test_tests_of_a_minimal_table_leave_the_rest_unmeasured(tmp_path):
+    [test] = read_tests(tmp_path, "test,size_mm,feed,total\nA,1,10,35\nA,4,100,100\n", "test,U_m_s,Fsp_N_mm2\nA,1,2\n")
+    assert [math.isnan(value) for value in test[3:11]] == [True] * 8
+    assert all(math.isnan(value) for value in (*test.centre, *test.edge))
+    assert test.total == pytest.approx([0.35, 1.0])
+
+
+def test_a_dry_test_has_no_moisture(tmp_path):
+    [test] = read_tests(tmp_path, operations="test,U_m_s,Fsp_N_mm2,moisture_pct\nA,1,2,0\n")
+    assert test.moisture == 0.0
+
+
+def test_nothing_is_derived_and_single_empty_cells_stay_nan(tmp_path):
+    [test] = read_tests(tmp_path)
+    assert (test.power, test.throughput) == pytest.approx((36e3, 5.0))
+    assert math.isnan(test.specific_energy)
+    assert test.centre == pytest.approx([0.4, math.nan, 1.0], nan_ok=True)
+
+
+def test_order_of_rows_and_columns_comments_and_byte_order_mark_do_not_matter(tmp_path):
+    plain = read_tests(tmp_path)
+    product = "\ufeff# by the laboratory\r\ntotal,test, size_mm ,feed,edge,centre\r\n\r\n70,A,2,50,60,\r\n"
+    product += "# half way\r\n100,A,4,100,100,100\r\n35,A,1,10,20,40\r\n,,,,,\r\n"
+    [other] = read_tests(tmp_path, product, "\ufeff" + OPERATIONS)
+    for one, two in zip(plain[0][1:], other[1:], strict=True):
+        assert one == pytest.approx(two, nan_ok=True)
+
+
+def test_tests_stand_in_the_order_of_the_operations(tmp_path):
+    product = PRODUCT + PRODUCT.replace("A,", "B,").partition("\n")[2]
+    tests = read_tests(tmp_path, product, OPERATIONS.replace("A,", "B,") + "A,1,3,,\n")
+    assert [(test.name, test.surface_speed) for test in tests] == [("B", 0.5), ("A", 1.0)]
+
+
+def test_arrays_of_a_test_are_read_only(tmp_path):
+    [test] = read_tests(tmp_path)
+    with pytest.raises(ValueError, match="read-only"):
+        test.total[0] = 0.0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("A,1,10,40", "A,1,10,-40", "p.csv: line 3, centre: got '-40'; must be at least 0 and at most 100"),
+        ("A,2,50", "A,2,101", "p.csv: line 4, feed: got '101'; must be at least 0 and at most 100"),
+        ("A,1,10", "A,1,55", "p.csv: line 4, feed: got 50 % at 2 mm in A; must not be below the 55 %"),
+        (",60,70", ",10,70", "p.csv: line 4, edge: got 10 %"),
+        ("A,4,100", "A,4,99.9", "p.csv: line 2, feed: got 99.9 at the coarsest sieve of A; must be 100"),
+        ("A,4,100,100,100,100", "A,4,100,100,100,97", "p.csv: line 2, total: got 97 at the coarsest sieve"),
+        ("A,2,", "A,1,", "p.csv: line 4, size_mm: got 1 twice for A (also in line 3)"),
+        ("A,2,", "A,0,", "p.csv: line 4, size_mm: got '0'; must be above 0"),
+        ("A,2,", "A,,", "p.csv: line 4, size_mm: got an empty cell; must be a number"),
+        ("A,2,", ",2,", "p.csv: line 4, test: got an empty cell"),
+        ("A,2,", "A,nan,", "p.csv: line 4, size_mm: got 'nan'; must be a finite number"),
+        ("60,70", "6O,70", "p.csv: line 4, edge: got '6O'; must be a number"),
+        ("A,2,50,,60,70", "A,2,50,,60", "p.csv: line 4: got 5 cells; must be 6"),
+        ("A,2,50,,60,70", "A,2,5,0,,60,70", "write decimals with a point"),
+        (",total", ",Total", "p.csv: line 1, header: got column 'Total'; must be one of test, size_mm"),
+        (",total", ",Total", "did you mean 'total'?"),
+        (",total", ",Total", "column 'total' is missing"),
+        ("centre", "feed", "got column 'feed' 2 times"),
+    ],
+)
+def test_impossible_products_are_refused(tmp_path, old, new, words):
+    assert old in PRODUCT
+    assert any(words in fault for fault in refused(tmp_path, PRODUCT.replace(old, new)))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("A,0.5", "A,0", "o.csv: line 2, U_m_s: got '0'; must be above 0; correct the cell"),
+        ("A,0.5", "A,-1", "o.csv: line 2, U_m_s: got '-1'"),
+        ("0.5,", ",", "o.csv: line 2, U_m_s: got an empty cell"),
+        ("2.5,", ",", "o.csv: line 2, Fsp_N_mm2: got an empty cell"),
+        (",36,", ",-36,", "o.csv: line 2, P_kW: got '-36'"),
+        (",36,", ",inf,", "o.csv: line 2, P_kW: got 'inf'; must be a finite number"),
+        ("U_m_s", "U_ms", "did you mean 'U_m_s'?"),
+        ("P_kW", "colour", "got column 'colour'; must be one of test, U_m_s, Fsp_N_mm2, gap_mm"),
+        ("A,0.5", "B,0.5", "o.csv: test 'A' of"),
+        ("A,0.5", "B,0.5", "p.csv: test 'B' of"),
+        ("A,0.5,2.5,36,18\n", "A,0.5,2.5,36,18\nA,1,2,,\n", "o.csv: line 3, test: got 'A' again (first in line 2)"),
+        ("A,0.5,2.5,36,18\n", "", "o.csv: no rows below the header"),
+        (OPERATIONS, "# nothing\n", "o.csv: the table is empty"),
+    ],
+)
+def test_impossible_operations_are_refused(tmp_path, old, new, words):
+    assert old in OPERATIONS
+    assert any(words in fault for fault in refused(tmp_path, operations=OPERATIONS.replace(old, new)))
+
+
+def test_faults_of_both_files_come_at_once_and_only_once(tmp_path):
+    faults = refused(
+        tmp_path,
+        PRODUCT.replace("A,1,10,40", "A,1,10,140") + "B,1,5,,,50\nB,2,90,,,100\n",
+        OPERATIONS.replace("A,0.5,2.5", "A,-0.5,x"),
+    )
+    assert len(faults) == 5
+    for fault, words in zip(faults, ("centre", "U_m_s", "Fsp_N_mm2", "test 'B'", "90"), strict=True):
+        assert words in fault
+
+
+def test_a_single_sieve_is_no_distribution(tmp_path):
+    [fault] = refused(tmp_path, "test,size_mm,feed,total\nA,4,100,100\n")
+    assert "line 2, test: got one sieve for A; must be at least two" in fault
+
+
+def test_a_table_in_another_encoding_is_refused(tmp_path):
+    path = tmp_path / "p.csv"
+    path.write_bytes(PRODUCT.encode("utf-16"))
+    with pytest.raises(ValueError, match="is not UTF-8; save the table as CSV in UTF-8"):
+        tables.read_pilot_tests(path, write(tmp_path / "o.csv", OPERATIONS))
+
+
+def test_missing_pilot_table_is_an_os_error(tmp_path):
+    with pytest.raises(OSError, match=r"none\.csv"):
+        tables.read_pilot_tests(tmp_path / "none.csv", write(tmp_path / "o.csv", OPERATIONS))

@@ -236,10 +236,12 @@ def test_a_gap_below_double_precision_is_refused_or_tiled():
     """At some gap, neighbours on the exit row are one point to GEOS: an error, never a silent hole."""
     outcomes = set()
     for gap in 10.0 ** -np.arange(8, 21, 2):
+        scene = scene_of(0.06, 50, 5)
+        narrow = scene.rolls.model_copy(update={"gap": float(gap)})  # a scene refuses gaps below 1 um
         try:
-            _, found = tiled(scene_of(float(gap), 50, 5))
+            _, found = tiled(scene.model_copy(update={"rolls": narrow}))
         except ValueError as error:
-            outcomes.add(str(error).partition("; ")[2].partition("; ")[0])
+            outcomes.add(str(error).split("; ")[2])
         else:
             assert abs(found.volume.sum() / found.domain.area - 1) < 1e-9
             assert (found.volume > 0).all()

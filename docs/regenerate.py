@@ -1,0 +1,57 @@
+"""Make the pictures of README.md and docs/ anew: `python docs/regenerate.py [PICTURE ...]`, by hand, in some minutes.
+
+Each picture is what a study draws by default; docs/files.md names the studies. What is larger than 250 kB is reduced
+to 256 colours.
+"""
+
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from PIL import Image
+
+from studies import accuracy, gap_sweep, paper, pilot, store
+
+DOCS = Path(__file__).parent
+LARGEST = 250_000  # bytes of a PNG that stays in all its colours
+
+# picture: (the study that draws it, the option --out of the study, relative to a folder)
+PICTURES: dict[str, tuple[Callable[[Sequence[str]], int], str]] = {
+    "gap_sweep.png": (gap_sweep.main, "gap_sweep.nc"),
+    "accuracy.png": (accuracy.main, "accuracy.nc"),
+    "pilot.png": (pilot.main, "pilot.nc"),
+    **{name: (paper.main, "") for name in (*paper.FIGURES, paper.ANIMATION)},
+}
+
+
+def main(names: Sequence[str]) -> int:
+    """Make these pictures, or all, and return the exit code: 1 if a study could not draw its own."""
+    unknown = sorted(set(names) - set(PICTURES))
+    if unknown:
+        print(f"error: got {', '.join(unknown)}; must be of {', '.join(PICTURES)}", file=sys.stderr)
+        return 2
+    wanted = names or list(PICTURES)
+    for study, out in dict.fromkeys(PICTURES[name] for name in wanted):
+        with tempfile.TemporaryDirectory() as folder:
+            if study(["--out", str(Path(folder) / out)]):
+                return 1
+            for name in wanted:
+                if PICTURES[name] == (study, out):
+                    put(Path(folder) / name, DOCS / name)
+    return 0
+
+
+def put(drawn: Path, place: Path) -> None:
+    """Put a drawn picture in its place, in fewer colours if it is large."""
+    if drawn.suffix == ".png" and drawn.stat().st_size > LARGEST:
+        with Image.open(drawn) as picture:
+            few = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
+        few.save(drawn, optimize=True)
+    content = drawn.read_bytes()
+    store.replace(place, lambda part: part.write_bytes(content))
+    print(f"{place}: {len(content):,} bytes")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

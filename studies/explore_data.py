@@ -1,0 +1,323 @@
+"""Sweep -> what the explorer's page holds: plain lists and text, ready for JSON.
+
+Numbers are means and sample standard deviations over the replicates that hold a result, in the units people read.
+Arrays are flat, operating points slowest, in the order of the swept axes; None stands for NaN.
+"""
+
+import itertools
+import json
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from pydantic import ValidationError
+
+from hpgr import feed, metrics, units
+from hpgr.scene import Feed, Scene
+from studies import report
+from studies.sweep import STATUS
+
+MOST_NUMBERS = 4_000_000  # in a page: about 30 MB, which a browser still opens in seconds
+DIGITS, SPREAD_DIGITS = 6, 4  # significant digits of means (float32 has about 7) and of standard deviations
+
+_CASE = ("operating_point", "replicate")
+_MADE = ("history", "source", "seed", "versions")  # attributes that tell how the sweep was made
+_MOST_LOST = 10  # lost operating points that the page lists; the others tell when they are selected
+
+
+def page_data(result: xr.Dataset, sieve: float, name: str) -> dict[str, Any]:
+    """Return everything the page of a sweep holds.
+
+    Parameters
+    ----------
+    result : xarray.Dataset
+        From `studies.sweep.sweep`, or read from a file of a study.
+    sieve : float
+        Sieve in m whose percent passing is shown first, within the recorded sieves.
+    name : str
+        What the page calls the sweep.
+
+    Raises
+    ------
+    ValueError
+        If the Dataset is no sweep, holds no result, is too large for a page, or the sieve is not within its sieves.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from studies.sweep import sweep
+    >>> base = hpgr.presets.paper().with_values({"resolution.cells": 100, "resolution.points": 50})
+    >>> data = page_data(sweep(base, {"rolls.gap": ["40 mm", "60 mm"]}), 0.001, "two gaps")
+    >>> data["axes"][0]["texts"]
+    ['40 mm', '60 mm']
+    """
+    require_sweep(result, name)
+    axes = report.axes_of(result)
+    scene = Scene.model_validate_json(result.attrs["scene"])
+    points = report.operating_points(result)
+    feeds, feed_of = feeds_of(result, scene)
+    sieved = with_sieve(result, sieve, max((one.coarsest for one in feeds if one), default=0.0))
+    refuse_too_many(result, sieved.get("sieve"), name)
+    sizes = {key: entry(values_of(report.operating_points(sieved), key)) for key in sieved.data_vars}
+    shown_sieves = sieved["sieve"].values if sizes else np.array([])
+    held = (points["status"] == STATUS["ok"]).sum("replicate").values
+    return {
+        "name": name,
+        "told": [line[0].upper() + line[1:] for line in told(result)],
+        "made": {key: str(result.attrs[key]) for key in _MADE if key in result.attrs},
+        "replicates": result.sizes["replicate"],
+        "axes": [axis_data(result[axis], scene) for axis in axes],
+        "start": start(result, scene, held),
+        "held": held.tolist(),
+        "said": [said(points.isel(operating_point=k)) for k in range(points.sizes["operating_point"])],
+        "kpis": kpis(points, sieve),
+        "streamlines": numbers(result["xi"].values) if "xi" in result else [],
+        "profiles": profiles(points),
+        "sieves": numbers(shown_sieves * 1e3),
+        "sieve": int(np.argmin(np.abs(shown_sieves - sieve))) if sizes else 0,
+        "passing": sizes,
+        "feeds": [numbers(feed.passing(one, shown_sieves)) if one and sizes else None for one in feeds],
+        "feed_of": feed_of,
+        "scene": json.loads(result.attrs["scene"]),
+    }  # fmt: skip
+
+
+def told(result: xr.Dataset) -> list[str]:
+    """Return what a page says of the whole sweep: notes, limits, lost cases."""
+    lost = report.lost_cases(result)
+    more = [f"and {len(lost) - _MOST_LOST} more lost operating points"] if len(lost) > _MOST_LOST else []
+    return report.notes(result) + lost[:_MOST_LOST] + more
+
+
+def require_sweep(result: xr.Dataset, name: str) -> None:
+    """Raise ValueError if a Dataset is not of a sweep, or holds no result at all."""
+    lacking = [each for each in ("replicate", "status", "message", "notes") if each not in result.variables]
+    lacking += [] if "scene" in result.attrs else ["the attribute scene"]
+    if lacking:
+        raise ValueError(
+            f"{name}: is not the result of a sweep: it lacks {', '.join(lacking)}; give a file that "
+            "python -m studies.gap_sweep, speed_sweep or feed_sweep has written, or a Dataset of studies.sweep.sweep"
+        )
+    if not report.any_result(result):
+        lines = report.lost_cases(result)
+        raise ValueError(f"{name}: no case holds a result, so there is nothing to show; the first: {lines[0]}")
+
+
+def refuse_too_many(result: xr.Dataset, sieves: xr.DataArray | None, name: str) -> None:
+    """Raise ValueError if a page would hold more than `MOST_NUMBERS` numbers."""
+    points = math.prod(result.sizes[axis] for axis in report.axes_of(result))
+    across = sum("streamline" in value.dims for value in result.data_vars.values())
+    each = len(result.data_vars) + across * result.sizes.get("streamline", 0)
+    if sieves is not None:
+        each += sieves.size * (1 + (result.sizes.get("streamline", 0) if "passing" in result else 0))
+    if 2 * points * each > MOST_NUMBERS:
+        axis = max(report.axes_of(result), key=lambda one: result.sizes[one])
+        raise ValueError(
+            f"{name}: {points} operating points of {each} means and spreads are {2 * points * each:.2g} numbers; "
+            f"a page holds at most {MOST_NUMBERS:.2g}, here {MOST_NUMBERS // (2 * each)} operating points; "
+            f'show a part: xarray.open_dataset("{name}").isel({axis}=slice(None, None, 2)).to_netcdf("part.nc")'
+        )
+
+
+def values_of(points: xr.Dataset, name: str) -> xr.DataArray:
+    """Return a variable in double precision, operating points and replicates first, NaN where a case is lost."""
+    values = points[name].astype(float)
+    if "status" in points:
+        values = values.where(points["status"] == STATUS["ok"])
+    return values.transpose(*_CASE, ...)
+
+
+def entry(values: xr.DataArray) -> dict[str, list]:
+    """Return the flat mean and standard deviation over the replicates."""
+    return {
+        "mean": numbers(values.mean("replicate").values),
+        "sd": numbers(report.spread(values).transpose("operating_point", ...).values, SPREAD_DIGITS),
+    }
+
+
+def numbers(values: np.ndarray, digits: int = DIGITS) -> list:
+    """Return an array flat, rounded to significant digits, whole numbers short, None for NaN.
+
+    Examples
+    --------
+    >>> numbers(np.array([0.123456789, 3.0, np.nan]))
+    [0.123457, 3, None]
+    """
+    return [_short(value, digits) for value in np.asarray(values, float).ravel().tolist()]
+
+
+def _short(value: float, digits: int) -> float | int | None:
+    if not math.isfinite(value):
+        return None
+    rounded = float(f"{value:.{digits}g}")
+    return int(rounded) if rounded.is_integer() and abs(rounded) < 1e15 else rounded
+
+
+def kpis(points: xr.Dataset, sieve: float) -> list[dict[str, Any]]:
+    """Return every figure of an operating point but the percent below a sieve, which the page takes from `passing`."""
+    ok = points["status"] == STATUS["ok"]
+    first = report.figures(points, sieve)
+    known = {heading: (values.where(ok), "") for heading, values in first.items() if not heading.startswith("below ")}
+    for name in of_dims(points, set(_CASE)):
+        if name not in ("status", "flags", *report.READ):
+            known[heading_of(points[name])] = (shown(points, name), points[name].attrs.get("long_name", ""))
+    return [
+        {"heading": heading, "about": about} | entry(values.transpose(*_CASE))
+        for heading, (values, about) in known.items()
+    ]
+
+
+def profiles(points: xr.Dataset) -> list[dict[str, Any]]:
+    """Return every variable that differs from streamline to streamline."""
+    return [
+        {"name": name, "heading": heading_of(points[name]), "about": points[name].attrs.get("long_name", "")}
+        | entry(shown(points, name))
+        for name in of_dims(points, {*_CASE, "streamline"})
+    ]
+
+
+def of_dims(points: xr.Dataset, dims: set[str]) -> list[str]:
+    """Return the names of the numeric variables that have just these dims."""
+    return [name for name, value in points.data_vars.items() if set(value.dims) == dims and value.dtype.kind in "fiu"]
+
+
+def shown(points: xr.Dataset, name: str) -> xr.DataArray:
+    """Return a variable in the unit it is shown in."""
+    return values_of(points, name) * units.SHOWN.get(points[name].attrs.get("units", "1"), ("", 1.0))[1]
+
+
+def heading_of(variable: xr.DataArray) -> str:
+    """Return a variable's name as words, with the unit it is shown in."""
+    words = variable.name.replace("_", " ").removesuffix(" total")
+    words = words[0].upper() + words[1:] if words in ("p50", "p80") else words
+    unit = variable.attrs.get("units", "1")
+    return words if unit == "1" else f"{words} [{units.SHOWN.get(unit, (unit,))[0]}]"
+
+
+def with_sieve(result: xr.Dataset, sieve: float, coarsest: float) -> xr.Dataset:
+    """Return the mass fractions passing, at the sieves that tell something and at `sieve`; none if stress only.
+
+    Left out are sieves that nothing passes, and that everything passes of products and of feeds, whose coarsest grain
+    is `coarsest` (m), but for the last and the first of them.
+    """
+    kept = result[[name for name in ("passing_total", "passing") if name in result]]
+    if not kept.data_vars:
+        return kept.drop_vars("sieve", errors="ignore")
+    known = kept["sieve"].values
+    if not known[0] <= sieve <= known[-1]:
+        raise ValueError(
+            f"--sieve: got {units.show(sieve, 'm')}; must lie within the recorded sieves, "
+            f"{units.show(known[0], 'm')} to {units.show(known[-1], 'm')}"
+        )
+    across = [name for name in kept["passing_total"].dims if name != "sieve"]
+    first = max(int(np.argmax(kept["passing_total"].max(across).values > 0)) - 1, 0)
+    beyond = kept["passing_total"].min(across).values >= 1
+    beyond &= known >= coarsest
+    last = int(np.argmax(beyond)) if beyond.any() else known.size - 1
+    if np.isclose(known, sieve, rtol=1e-9).any():
+        sieve = known[np.argmin(np.abs(known - sieve))]
+    wanted = np.union1d(known[first : last + 1], [sieve])
+    return xr.Dataset({name: metrics.between_sieves(kept[name], wanted) for name in kept}).assign(
+        status=result["status"]
+    )
+
+
+def axis_data(axis: xr.DataArray, scene: Scene) -> dict[str, Any]:
+    """Return a swept axis: labels, values, the order of its slider, and what each value changes in the scene."""
+    field, unit = axis.attrs["scene_field"], axis.attrs["units"]
+    raw = axis.values.tolist()
+    numeric = axis.dtype.kind in "fiu"
+    values = report.shown_values(axis)
+    return {
+        "name": axis.name,
+        "words": axis.name.replace("_", " "),
+        "label": report.axis_label(axis),
+        "about": axis.attrs.get("long_name", ""),
+        "field": field,
+        "values": numbers(values) if numeric and np.isfinite(values).all() else None,
+        "texts": [units.show(value, unit) if numeric else str(value) for value in raw],
+        "order": np.argsort(values, kind="stable").tolist() if numeric else list(range(axis.size)),
+        "raw": [_plain(value) for value in raw],
+        "changes": [changes(scene, field, value) for value in raw],
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON can hold it, and a scene file reads it: infinity is text there."""
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def changes(scene: Scene, field: str, value: Any) -> dict[str, Any]:
+    """Return the fields, by dotted name, that a scene changes when one is given a value; a level changes several."""
+    try:
+        other = scene.with_values({field: value})
+    except ValidationError:  # a case that was refused
+        return {field: _plain(value)}
+    before, after = (json.loads(one.model_dump_json()) for one in (scene, other))
+    section = field.partition(".")[0]
+    old = before[section] or {}
+    return {f"{section}.{key}": new for key, new in after[section].items() if key not in old or old[key] != new}
+
+
+def start(result: xr.Dataset, scene: Scene, held: np.ndarray) -> list[int]:
+    """Return the places on the axes of the operating point shown first: the scene's own, or the next with a result."""
+    shape = [result.sizes[name] for name in report.axes_of(result)]
+    if not shape:
+        return []
+    own = [_nearest(result[name], scene) for name in report.axes_of(result)]
+    full = np.argwhere(held.reshape(shape) > 0)
+    return full[np.argmin(np.abs(full - own).sum(axis=1))].tolist()
+
+
+def _nearest(axis: xr.DataArray, scene: Scene) -> int:
+    section, _, key = axis.attrs["scene_field"].partition(".")
+    own = getattr(getattr(scene, section), key, None)
+    values = axis.values
+    if axis.dtype.kind in "fiu":
+        if own is None or not math.isfinite(own):
+            return axis.size // 2
+        return int(np.argmin(np.abs(np.nan_to_num(values.astype(float)) - own)))
+    return int(np.argmax(values == own))  # the first, if it is none of them
+
+
+def feeds_of(result: xr.Dataset, scene: Scene) -> tuple[list[Feed | None], list[int]]:
+    """Return every feed of the sweep, None where a scene is refused, and the number of each operating point's feed."""
+    axes = report.axes_of(result)
+    fields = {name: result[name].attrs["scene_field"] for name in axes}
+    swept = [name for name in axes if fields[name].startswith("feed.")]
+    every = list(itertools.product(*(range(result.sizes[name]) for name in swept)))
+    values = [
+        {fields[name]: result[name].values[k].item() for name, k in zip(swept, place, strict=True)} for place in every
+    ]
+    places = itertools.product(*(range(result.sizes[name]) for name in axes))
+    chosen = [tuple(k for name, k in zip(axes, place, strict=True) if name in swept) for place in places]
+    return [_feed(scene, each) for each in values], [every.index(place) for place in chosen]
+
+
+def _feed(scene: Scene, values: dict[str, Any]) -> Feed | None:
+    try:
+        return scene.with_values(values).feed
+    except ValidationError:
+        return None
+
+
+def said(point: xr.Dataset) -> list[list]:
+    """Return what became of an operating point, as [what, replicates it holds for, words], lost cases first."""
+    words = {number: word for word, number in STATUS.items()}
+    status, messages, notes = (np.atleast_1d(point[name].values) for name in ("status", "message", "notes"))
+    lost = [(words[int(state)], str(text)) for state, text in zip(status, messages, strict=True) if state]
+    counted = [[what, count, text] for (what, text), count in _counts(lost)]
+    lines = [line.partition(": ") for note in notes for line in str(note).splitlines()]
+    first = {name: text for name, _, text in reversed(lines)}
+    return counted + [
+        [name.replace("_", " "), count, first[name]] for name, count in _counts(line[0] for line in lines)
+    ]
+
+
+def _counts(values: Iterable) -> list[tuple[Any, int]]:
+    found: dict[Any, int] = {}
+    for value in values:
+        found[value] = found.get(value, 0) + 1
+    return list(found.items())

@@ -1,0 +1,422 @@
+"""Baselines against their published figures, closed forms, direct integration and planted parameters."""
+
+import math
+from importlib.resources import files
+
+import numpy as np
+import pytest
+from scipy import integrate, linalg
+
+from hpgr import baselines, tables
+from hpgr.baselines import HindeKalala, Machine, TorresCasali
+
+KWH_PER_T = 3600.0  # J kg-1
+KHD = Machine(diameter=0.80, width=0.25, solid_density=2740.0, bulk_density=1630.0, cake_density=2300.0)
+
+# the published worked case
+WORKED = Machine(diameter=1.0, width=0.75, solid_density=2700.0, bulk_density=1600.0, cake_density=2300.0)
+WORKED_PARAMETERS = TorresCasali(0.13, 0.15, 2.86, 1.43 / KWH_PER_T, -0.06, -0.46, 0.21)
+WORKED_SIZES = np.array([12.7e-3, 25.4e-3, 50.8e-3])
+WORKED_FEED = np.array([0.25, 0.5, 1.0])
+PRINTED_POWERS = np.array([96.58e3, 174.59e3, 96.58e3])
+
+SIZES = 0.032 * 2.0 ** np.arange(-9, 1)
+FEED = np.clip((SIZES / 0.032) ** 0.8, 0, 1)
+PLANTED = TorresCasali(0.35, 0.5, 4.0, 1.8 / KWH_PER_T, 0.3, -0.15, 0.2)
+
+
+@pytest.fixture(scope="module")
+def pilot():
+    data = files("hpgr") / "data"
+    return tables.read_pilot_tests(data / "khd_porphyry_psd.csv", data / "khd_porphyry_operations.csv")
+
+
+def made_up(name="A", speed=0.7, force=3e6, **measured):
+    """Return a test without any measured product."""
+    nothing = np.full(len(SIZES), math.nan)
+    values = {
+        "gap": 0.018, "cake_thickness": 0.022, "throughput": math.nan, "specific_throughput": math.nan,
+        "power": math.nan, "specific_energy": math.nan, "hydraulic_pressure": 2 * force, "moisture": math.nan,
+        "sizes": SIZES, "feed": FEED, "centre": nothing, "edge": nothing, "total": nothing,
+    }  # fmt: skip
+    return tables.PilotTest(name, speed, force, **(values | measured))
+
+
+def as_measured(test, prediction):
+    return test._replace(**{name: getattr(prediction, name) for name in baselines.PRODUCTS})
+
+
+# ---------------------------------------------------------------------------- Torres & Casali, worked case
+
+
+def test_worked_case_of_the_machine():
+    angle = baselines.nip_angle(WORKED, 0.03)
+    flow = baselines.throughput(WORKED, 0.03, 1.0)
+    force = baselines.pressing_force(WORKED, 60e5)
+    power = baselines.power(force, angle, 1.0)
+    assert math.degrees(angle) == pytest.approx(9.504, abs=5e-4)
+    assert flow * 3.6 == pytest.approx(186.3, abs=0.05)
+    assert force == pytest.approx(2250e3)
+    assert power / 1e3 == pytest.approx(372.8, abs=0.05)
+    assert power / flow / KWH_PER_T == pytest.approx(2.001, abs=5e-4)
+    assert baselines.power(force, math.radians(9.47), 1.0) == pytest.approx(371.46e3, rel=5e-5)  # as printed
+
+
+def test_worked_case_prints_powers_of_shares_rounded_to_two_digits():
+    shares = baselines.power_shares(3)
+    assert shares.sum() == pytest.approx(1.0)
+    assert 371.46e3 * np.round(shares, 2) == pytest.approx(PRINTED_POWERS, abs=5)
+    assert shares * 371.46e3 != pytest.approx(PRINTED_POWERS, rel=0.01)
+
+
+def worked_products():
+    """Retained percent, coarse to fine, at the printed block powers."""
+    flow = baselines.throughput(WORKED, 0.03, 1.0)
+    reference = baselines.coarsest_class(WORKED_SIZES)
+    blocks = baselines.block_products(
+        WORKED_PARAMETERS, WORKED_SIZES, WORKED_FEED, PRINTED_POWERS * 3 / flow, reference
+    )
+    return {name: 100 * masses for name, masses in baselines.combine(blocks, WORKED_PARAMETERS.edge_share).items()}
+
+
+def test_worked_case_retains_the_printed_coarsest_class():
+    found = worked_products()
+    assert (found["total"][0], found["edge"][0], found["centre"][0]) == pytest.approx((3.91, 5.41, 3.51), abs=0.006)
+
+
+def test_printed_products_of_the_worked_case_mix_as_here():
+    """Centre from total and edge; the printed total of the finest class, 80.31, leaves 0.04 missing from 100."""
+    total, edge, centre = np.array([[3.91, 15.74, 80.35], [5.41, 18.94, 75.65], [3.51, 14.89, 81.60]])
+    assert 0.21 * edge + 0.79 * centre == pytest.approx(total, abs=0.008)
+    found = worked_products()
+    assert 0.21 * found["edge"] + 0.79 * found["centre"] == pytest.approx(found["total"], abs=1e-12)
+
+
+def test_second_class_of_the_worked_case_is_the_closed_form_of_its_formulas_and_not_the_print():
+    """The formulas give b_21 = 0.763 and S_2 = 1.195; the printed 18.94 and 15.74 % need 0.441 and 0.671."""
+
+    def second(exponent, born, rate):
+        first, fed = 1.43, 25.0
+        grown = 50 * born * first / (rate - first) * (math.exp(-first * exponent) - math.exp(-rate * exponent))
+        return grown + fed * math.exp(-rate * exponent)
+
+    outer, inner = PRINTED_POWERS[:2] / 1e3 / 62.1
+    log = math.log(0.5)
+    formulas = (1 - (0.13 * 0.5**0.15 + 0.87 * 0.5**2.86), 1.43 * math.exp(-0.06 * log - 0.46 * log**2))
+    found = worked_products()
+    assert found["edge"][1] == pytest.approx(second(outer, *formulas), abs=1e-9)
+    assert 3 * found["total"][1] == pytest.approx(2 * second(outer, *formulas) + second(inner, *formulas), abs=1e-9)
+    needed = (0.441, 0.6712)
+    assert second(outer, *needed) == pytest.approx(18.94, abs=0.01)
+    assert 2 * second(outer, *needed) + second(inner, *needed) == pytest.approx(3 * 15.74, abs=0.03)
+
+
+# ---------------------------------------------------------------------------- Torres & Casali, the balance
+
+
+def test_fragments_add_up_to_what_broke_and_are_all_finer():
+    for sizes in (SIZES, np.array([0.125, 0.2, 1.0, 2.8, 45.0]) * 1e-3):
+        born = baselines.breakage(PLANTED, sizes)
+        assert born[:, :-1].sum(axis=0) == pytest.approx(1.0)
+        assert (born >= 0).all()
+        assert not np.triu(born).any()
+
+
+def test_fragments_on_sieves_in_one_ratio_are_the_printed_ones():
+    x = SIZES[::-1]
+    finer = PLANTED.fine_share * (x / x[1]) ** PLANTED.fine_exponent
+    finer += (1 - PLANTED.fine_share) * (x / x[1]) ** PLANTED.coarse_exponent
+    born = baselines.breakage(PLANTED, SIZES)
+    for i in range(2, len(x)):
+        for j in range(1, i):
+            assert born[i - 1, j - 1] == pytest.approx(finer[i - j] - finer[i - j + 1])  # B_{i-j+1} - B_{i-j+2}
+
+
+def test_blocks_keep_the_mass_and_break_coarse_classes():
+    energies = np.array([0.0, 0.5, 2.0, 50.0]) * KWH_PER_T
+    masses = baselines.block_products(PLANTED, SIZES, FEED, energies, 0.03)
+    assert masses.sum(axis=1) == pytest.approx(1.0)
+    assert (masses >= -1e-15).all()
+    assert (np.diff(masses[:, 0]) < 0).all()
+    assert np.cumsum(masses[0, ::-1]) == pytest.approx(FEED)
+
+
+def test_blocks_against_integration_along_the_nip():
+    """v_z dm/dz over z*, with hold-up, speed and power as the article has them."""
+    machine, opening, speed, count, block = WORKED, 0.03, 1.3, 4, 1
+    angle, flow = baselines.nip_angle(machine, opening), baselines.throughput(machine, opening, speed)
+    watts = baselines.power_shares(count) * 400e3
+    length = machine.diameter / 2 * math.sin(angle)
+    holdup = flow * length / (speed * count)
+    reference = baselines.coarsest_class(SIZES)
+    rates = baselines.selection(PLANTED, SIZES, reference) * watts[block] / holdup  # s-1
+    born = baselines.breakage(PLANTED, SIZES)
+
+    def slope(_, masses):
+        return (born @ (rates * masses) - rates * masses) / speed
+
+    feed = -np.diff(FEED[::-1], append=0.0)
+    path = integrate.solve_ivp(slope, (0, length), feed, rtol=1e-9, atol=1e-12)
+    found = baselines.block_products(PLANTED, SIZES, FEED, watts * count / flow, reference)
+    assert found[block] == pytest.approx(path.y[:, -1], abs=1e-8)
+    assert found[0] != pytest.approx(path.y[:, -1], abs=1e-2)
+
+
+def test_blocks_against_the_matrix_exponential():
+    rates = baselines.selection(PLANTED, SIZES, 0.03)
+    matrix = baselines.breakage(PLANTED, SIZES) * rates - np.diag(rates)
+    feed = -np.diff(FEED[::-1], append=0.0)
+    energies = np.array([3.0, 0.02, 3.0, 5.0]) * KWH_PER_T
+    expected = [linalg.expm(energy * matrix) @ feed for energy in energies]
+    found = baselines.block_products(PLANTED, SIZES, FEED, energies, 0.03)
+    assert np.abs(found - expected).max() < 1e-13
+
+
+def test_a_prediction_spreads_its_power_over_the_blocks():
+    fit = baselines.TorresCasaliFit(PLANTED, KHD, 0.03, 4, "gap", "hydraulic_pressure", math.nan, (), True)
+    run = made_up()
+    flow = 2300 * 0.018 * 0.25 * 0.7
+    watts = 6e6 * 0.4 * 0.25 * 2 * math.sin(baselines.nip_angle(KHD, 0.018) / 2) * 0.7
+    energies = watts * np.array([7, 15, 15, 7]) / 44 / (flow / 4)
+    masses = baselines.block_products(PLANTED, SIZES, FEED, energies, 0.03)
+    found = fit.predict(run)
+    assert (found.throughput, found.power) == pytest.approx((flow, watts))
+    assert found.total == pytest.approx(np.cumsum(masses.mean(axis=0)[::-1]))
+    assert found.edge == pytest.approx(np.cumsum(masses[0, ::-1]))
+
+
+@pytest.mark.parametrize(
+    ("blocks", "share", "weights"),
+    [
+        (3, 0.21, [0.5, 0, 0.5]),
+        (10, 0.2, [0.5, 0, 0, 0, 0, 0, 0, 0, 0, 0.5]),
+        (10, 0.3, [1 / 3, 1 / 6, 0, 0, 0, 0, 0, 0, 1 / 6, 1 / 3]),
+        (1, 0.3, [1.0]),
+    ],
+)
+def test_edge_is_taken_from_the_two_ends(blocks, share, weights):
+    assert baselines.edge_weights(blocks, share) == pytest.approx(weights)
+
+
+def test_predictions_are_distributions_with_the_centre_finest(pilot):
+    fit = baselines.TorresCasaliFit(
+        PLANTED, KHD, 0.0376, 10, "cake_thickness", "specific_pressing_force", math.nan, (), True
+    )
+    for test in pilot:
+        found = fit.predict(test)
+        for name in baselines.PRODUCTS:
+            passing = getattr(found, name)
+            assert (np.diff(passing) >= -1e-12).all()
+            assert passing[-1] == pytest.approx(1.0)
+        assert (found.centre - found.edge >= -1e-12).all()
+        assert found.specific_energy == pytest.approx(found.power / found.throughput)
+        assert found.power == pytest.approx(
+            2 * test.specific_pressing_force * 0.8 * 0.25 * test.surface_speed
+            * math.sin(baselines.nip_angle(KHD, test.cake_thickness) / 2)
+        )  # fmt: skip
+
+
+# ---------------------------------------------------------------------------- Hinde & Kalala
+
+HINDE = HindeKalala(4.0 / KWH_PER_T, 0.5, 0.6, 2.5, 0.2, 0.4)
+
+
+def test_no_energy_leaves_the_feed():
+    assert 1 - baselines.retained(HINDE, SIZES, FEED, 0.0, 0.032) == pytest.approx(FEED)
+
+
+def test_decay_rises_with_size_from_power_to_power():
+    rates = baselines.decay(HINDE, np.array([1e-9, 2e-9, 0.032, 32.0, 64.0]), 0.032)
+    assert rates[2] == pytest.approx(HINDE.rate)
+    assert rates[1] / rates[0] == pytest.approx(2**0.5, rel=1e-3)
+    assert rates[4] / rates[3] == pytest.approx(2**2.5, rel=1e-3)
+
+
+def test_decay_of_what_is_retained_is_a_population_balance():
+    """Integrate rates and fragments tied as the docstring says."""
+    x = SIZES[::-1]
+    decay = baselines.decay(HINDE, x, 0.032)
+    rates = np.append(decay[1:], 0.0)
+    finer = np.minimum(decay[:, None] / np.append(decay[1:], np.inf), 1.0)  # share of class j that passes x_i
+    born = np.tril(finer - np.vstack([finer[1:], np.zeros(len(x))]), -1)
+    assert born[:, :-1].sum(axis=0) == pytest.approx(1.0)
+    energy = 2.0 * KWH_PER_T
+    feed = -np.diff(FEED[::-1], append=0.0)
+    masses = linalg.expm(energy * (born * rates - np.diag(rates))) @ feed
+    found = 1 - baselines.retained(HINDE, SIZES, FEED, energy, 0.032)
+    assert found == pytest.approx(np.cumsum(masses[::-1]), abs=1e-12)
+
+
+def test_edge_and_centre_share_the_energy():
+    fit = baselines.HindeKalalaFit(HINDE, 0.032, 0.002, math.nan, (), True)
+    found = fit.predict(made_up())
+    each = [
+        -np.log((1 - passing[:-1]) / (1 - FEED[:-1])) / baselines.decay(HINDE, SIZES, 0.032)[:-1]
+        for passing in (found.edge, found.centre)
+    ]
+    assert each[0] == pytest.approx(0.4 * 0.002 * 3e6)
+    assert 0.2 * each[0] + 0.8 * each[1] == pytest.approx(found.specific_energy)
+    assert found.total == pytest.approx(0.2 * found.edge + 0.8 * found.centre)
+    assert math.isnan(found.power)
+    assert math.isnan(found.throughput)
+
+
+# ---------------------------------------------------------------------------- fits
+
+
+def test_torres_casali_recovers_planted_parameters():
+    runs = [made_up("A", 0.7, 2e6), made_up("B", 0.5, 4.5e6, cake_thickness=0.021)]
+    planted = baselines.TorresCasaliFit(
+        PLANTED, KHD, baselines.coarsest_class(SIZES), 10, "cake_thickness", "hydraulic_pressure", 0.0, (), True
+    )
+    fit = baselines.fit_torres_casali([as_measured(run, planted.predict(run)) for run in runs], KHD)
+    assert fit.parameters == pytest.approx(PLANTED, rel=1e-3)
+    assert fit.rmse < 1e-4
+    assert fit.at_bounds == ()
+    assert fit.settled
+
+
+def test_hinde_kalala_recovers_planted_parameters():
+    planted = baselines.HindeKalalaFit(HINDE, 0.032, 0.002, 0.0, (), True)
+    runs = [made_up("A", force=force, specific_energy=0.002 * force) for force in (2e6, 5e6)]
+    fit = baselines.fit_hinde_kalala([as_measured(run, planted.predict(run)) for run in runs])
+    assert fit.parameters == pytest.approx(HINDE, rel=1e-3)
+    assert fit.energy_per_force == pytest.approx(0.002)
+    assert fit.rmse < 1e-4
+
+
+def test_energy_per_force_is_fitted_and_power_over_throughput_counts_as_measured():
+    planted = baselines.HindeKalalaFit(HINDE, 0.032, 0.002, 0.0, (), True)
+    runs = [
+        made_up("A", force=2e6, specific_energy=5000.0),
+        made_up("B", force=4e6, power=70e3, throughput=10.0),
+        made_up("C", force=3e6),
+    ]
+    fit = baselines.fit_hinde_kalala(
+        [as_measured(run, planted.predict(run)) for run in runs], fixed=HINDE._asdict() | {"edge_energy": 1.0}
+    )
+    assert fit.energy_per_force == pytest.approx((2e6 * 5000 + 4e6 * 7000) / (4e12 + 16e12))
+    assert fit.parameters == HINDE._replace(edge_energy=1.0)
+    assert fit.at_bounds == ()
+
+
+def test_fixed_parameters_stay(pilot):
+    fixed = {"edge_share": 0.22, "coarse_exponent": 3.51}
+    fit = baselines.fit_torres_casali(pilot[:1], KHD, fixed)
+    assert fit.parameters._asdict() | fixed == fit.parameters._asdict()
+    fixed = {"edge_share": 0.18, "exponent": 3.0, "coarse_exponent": 0.5}
+    fit = baselines.fit_hinde_kalala(pilot[:1], fixed)
+    assert fit.parameters._asdict() | fixed == fit.parameters._asdict()
+
+
+def test_searches_that_ran_out_of_evaluations_say_so(pilot, monkeypatch):
+    monkeypatch.setattr(baselines, "_EVALUATIONS", 2)
+    assert not baselines.fit_hinde_kalala(pilot[:1]).settled
+
+
+def test_total_alone_can_be_fitted_with_the_edge_given(pilot):
+    nothing = np.full(13, math.nan)
+    bare = [test._replace(centre=nothing, edge=nothing) for test in pilot[:1]]
+    fit = baselines.fit_hinde_kalala(bare, {"edge_share": 0.2, "edge_energy": 0.4})
+    assert fit.rmse < 1.0
+    found = baselines.rmse(fit.predict(bare[0]), bare[0])
+    assert math.isnan(found["centre"])
+    assert found["total"] == pytest.approx(fit.rmse)
+
+
+def test_blind_predictions_of_the_pilot_tests(pilot):
+    """Fitted to P1 and P3; the figures of docs/validation.md, to its digits."""
+    first, second, third, fourth, fifth = pilot
+    torres = baselines.fit_torres_casali([first, third], KHD)
+    hinde = baselines.fit_hinde_kalala([first, third])
+    assert torres.at_bounds == ("coarse_exponent",)
+    expected = {
+        torres: [(3.41, 2.57, 3.37), (1.52, 3.41, 0.84), (2.87, 4.06, 2.23)],
+        hinde: [(4.88, 2.31, 3.83), (1.31, 3.09, 1.30), (2.43, 4.13, 2.78)],
+    }
+    for fit, figures in expected.items():
+        for test, figure in zip((second, fourth, fifth), figures, strict=True):
+            found = baselines.rmse(fit.predict(test), test)
+            assert tuple(found.values()) == pytest.approx(figure, abs=0.02), (type(fit), test.name)
+    errors = {
+        (test.name, name): 100 * (getattr(torres.predict(test), name) / getattr(test, name) - 1)
+        for test in (second, fourth, fifth)
+        for name in ("throughput", "power", "specific_energy")
+    }
+    assert list(errors.values()) == pytest.approx([-5.5, -4.0, 1.8, -0.5, -1.1, -0.3, 2.9, 8.8, 5.8], abs=0.06)
+
+
+def test_predictions_look_at_nothing_that_was_measured_of_the_outcome(pilot):
+    nothing = np.full(13, math.nan)
+    bare = pilot[4]._replace(
+        centre=nothing, edge=nothing, total=nothing, power=math.nan, throughput=math.nan,
+        specific_throughput=math.nan, specific_energy=math.nan, gap=math.nan,
+    )  # fmt: skip
+    fits = (
+        baselines.TorresCasaliFit(PLANTED, KHD, 0.04, 3, "cake_thickness", "hydraulic_pressure", 0.0, (), True),
+        baselines.HindeKalalaFit(HINDE, 0.045, 0.002, 0.0, (), True),
+    )
+    for fit in fits:
+        for one, two in zip(fit.predict(bare), fit.predict(pilot[4]), strict=True):
+            assert one == pytest.approx(two, nan_ok=True)
+
+
+# ---------------------------------------------------------------------------- bad input
+
+
+def refused(*, kind=baselines.fit_torres_casali, tests=None, **arguments):
+    arguments = ({"machine": KHD} if kind is baselines.fit_torres_casali else {}) | arguments
+    full = np.linspace(0.2, 1.0, len(SIZES))
+    tests = [made_up(centre=full, edge=full, total=full, specific_energy=6000.0)] if tests is None else tests
+    with pytest.raises(ValueError, match=r": got |: not measured") as error:
+        kind(tests, **arguments)
+    return str(error.value)
+
+
+def test_impossible_machines_are_refused_with_every_fault():
+    said = refused(machine=Machine(-0.8, math.nan, 2700.0, 1600.0, 2300.0), blocks=0, opening="flake", force="Rp")
+    for words in (
+        "machine.diameter: got -0.8; must be above 0",
+        "machine.width: got nan",
+        "blocks: got 0; must be at least 1",
+        "opening: got 'flake'; must be one of cake_thickness, gap",
+        "force: got 'Rp'; must be one of hydraulic_pressure, specific_pressing_force",
+    ):
+        assert words in said
+    assert "must rise in this order" in refused(machine=KHD._replace(cake_density=2800.0))
+
+
+def test_unmeasured_input_of_the_model_is_refused_naming_the_test():
+    bare = made_up("K-7", cake_thickness=math.nan, hydraulic_pressure=math.nan)
+    said = refused(tests=[bare])
+    assert "test K-7, cake_thickness: not measured; the model needs it; measure it or pass opening='gap'" in said
+    assert "test K-7, hydraulic_pressure: not measured" in said
+    fit = baselines.TorresCasaliFit(PLANTED, KHD, 0.03, 3, "cake_thickness", "hydraulic_pressure", 0.0, (), True)
+    with pytest.raises(ValueError, match="test K-7, cake_thickness: not measured"):
+        fit.predict(bare)
+
+
+def test_fixed_parameters_are_checked():
+    said = refused(fixed={"edge_shares": 0.2, "fine_share": 1.5})
+    assert "fixed: got 'edge_shares'; must be one of fine_share" in said
+    assert "did you mean 'edge_share'?" in said
+    assert "fixed fine_share: got 1.5; must be within" in said
+
+
+@pytest.mark.parametrize("kind", [baselines.fit_torres_casali, baselines.fit_hinde_kalala])
+def test_fits_need_tests_with_enough_measured(kind):
+    assert "tests: got none" in refused(kind=kind, tests=[])
+    total = made_up(total=FEED, specific_energy=6000.0)
+    assert "edge_share" in refused(kind=kind, tests=[total])
+    few = np.where(np.arange(len(SIZES)) < 3, 0.5, math.nan)
+    assert "must be at least the" in refused(kind=kind, tests=[made_up(edge=few, specific_energy=6000.0)])
+
+
+def test_hinde_kalala_needs_one_measured_energy():
+    bare = made_up(centre=FEED, edge=FEED, total=FEED, power=50e3)
+    assert "specific_energy: got no measured one" in refused(kind=baselines.fit_hinde_kalala, tests=[bare])
+
+
+def test_openings_the_rolls_cannot_nip_are_refused():
+    with pytest.raises(ValueError, match="cannot nip so much"):
+        baselines.nip_angle(KHD, 0.5)
