@@ -11,7 +11,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from studies import accuracy, gap_sweep, paper, store
+from studies import accuracy, gap_sweep, paper, pilot, store
 
 DOCS = Path(__file__).parent
 LARGEST = 250_000  # bytes of a PNG that stays in all its colours
@@ -20,6 +20,7 @@ LARGEST = 250_000  # bytes of a PNG that stays in all its colours
 PICTURES: dict[str, tuple[Callable[[Sequence[str]], int], str]] = {
     "gap_sweep.png": (gap_sweep.main, "gap_sweep.nc"),
     "accuracy.png": (accuracy.main, "accuracy.nc"),
+    "pilot.png": (pilot.main, "pilot.nc"),
     **{name: (paper.main, "") for name in (*paper.FIGURES, paper.ANIMATION)},
 }
 

@@ -177,7 +177,8 @@ def _lay_nip(scene: Scene, geometry: Geometry, points: int):
     """Return the same for profile "nip"; panels end at the nip, where the speed has a kink."""
     height, nip = geometry.height, nip_height(scene, geometry)
     wide = geometry.outer(nip)
-    top = max(height * (1 - scene.flow.entry_fraction), nip)
+    # high enough, on the mid-plane, that in the same time no tube begins below the nip, already compacted
+    top = max(height * (1 - scene.flow.entry_fraction), nip * math.hypot(1, geometry.slope(nip)))
 
     def slowness(xi, place):
         y = place * height
@@ -187,7 +188,7 @@ def _lay_nip(scene: Scene, geometry: Geometry, points: int):
 
     half = _PANELS // 2
     edges = np.concatenate([np.linspace(0.0, nip, half + 1), np.linspace(nip, top, half + 1)[1:]]) / height
-    place, duration = _march_back(geometry.xi, slowness, edges[: _PANELS + 1 if top > nip else half + 1], points)
+    place, duration = _march_back(geometry.xi, slowness, edges, points)
     y = height * place
     slope, own = geometry.xi[:, None] * geometry.slope(nip), geometry.xi[:, None] * geometry.slope(y)
     above = np.sqrt((1 + own * own) / (1 + slope * slope)) * wide / geometry.outer(y)

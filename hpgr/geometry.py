@@ -68,7 +68,8 @@ def bed(rolls: Rolls, streamlines: int) -> Geometry:
     b = c = 0.0
     if height > 0:
         slope = height / (radius - rise)
-        b = (3 * rise - slope * height) / height**2
-        c = (slope * height - 2 * rise) / height**3
+        # products, not powers: lengths times a power of two then give the same bits times theirs
+        b = (3 * rise - slope * height) / (height * height)
+        c = (slope * height - 2 * rise) / (height * height * height)
     xi = (np.arange(streamlines) + 0.5) / streamlines
     return Geometry(rolls.gap / 2, height, b, c, radius, xi)

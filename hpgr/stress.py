@@ -165,7 +165,8 @@ def _sum_below(increments, eps_v, ratio):
         return total, np.zeros(total.shape, dtype=bool)
     room = ratio * eps_v - total
     lowest = np.minimum.accumulate(np.minimum(room, 0.0), axis=1)
-    return np.maximum(total + lowest, 0.0), (room <= lowest) & (eps_v > 0)
+    # where the limit is tiny beside the plain sum, rounding would carry their difference past it
+    return np.clip(total + lowest, 0.0, ratio * eps_v), (room <= lowest) & (eps_v > 0)
 
 
 def _ratio(eps_s, eps_v):

@@ -424,7 +424,7 @@ def _write(result: "xr.Dataset", options: Options) -> list[Path]:
         store.write_dataset(result, out)
         for ending, figure in _figures(result).items() if options.plot else ():
             path = out.with_name(f"{out.stem}{ending}.png")
-            store.replace(path, lambda part, figure=figure: figure.savefig(part, dpi=110))
+            store.replace(path, lambda part, figure=figure: figure.savefig(part, dpi=75))
             written.append(path)
     except OSError as error:
         raise OSError(f"could not write the result: {error}") from error

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import ValidationError
 
 import hpgr
-from hpgr import budget, pipeline, schema
+from hpgr import budget, machine, pipeline, schema
 from hpgr import tolerance as tolerances
 from hpgr.keys import refuse_key
 from hpgr.scene import Scene, faults_of, field_info, field_value, level_text
@@ -178,10 +178,10 @@ class Bench:
     def simulate(self, case: Case) -> dict[str, Any]:
         """Return the variables of a case by name, as `hpgr.simulate` would."""
         if case.values != self._values:
-            self._scene, self._values = self._base.with_values(case.values), None
+            self._scene, self._values = machine.at_operating_gap(self._base.with_values(case.values)), None
             if self._tolerance is not None:
                 estimate = tolerances.refine(self._scene, self._tolerance, self._max_cost, self._seed)
-                self._scene, self._chosen = estimate.scene, estimate.variables()
+                self._scene, self._chosen = machine.at_operating_gap(estimate.scene), estimate.variables()
             budget.refuse_too_large(self._scene, self._room)
             self._values = case.values  # now only: a refused scene must not be taken for the next replicate's
         key = pipeline.bed_key(self._scene)

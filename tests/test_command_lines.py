@@ -239,13 +239,14 @@ def test_scene_from_toml_and_json(run, folder):
 
 
 @pytest.mark.parametrize("name", STUDIES)
-def test_khd_pilot_says_that_it_is_uncalibrated(run, name):
+def test_khd_pilot_says_what_it_is_calibrated_on(run, name):
     code, out, _ = run("--scene", "khd_pilot", "--no-plot", "--replicates", "1", study=STUDIES[name])
     assert code == 0
-    assert "note: uncalibrated" in out
+    note = "ore and machine as fitted to pilot tests P1 and P3"
+    assert f"note: {note}" in out
     scene = hpgr.Scene.model_validate_json(opened(f"outputs/{name}.nc").attrs["scene"])
     assert (scene.rolls.diameter, scene.rolls.width) == (0.8, 0.25)
-    assert "uncalibrated" in scene.note
+    assert scene.note.startswith(note)
 
 
 def test_feed_table_beside_the_scene_file(run, folder):

@@ -2,10 +2,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 from scipy.integrate import quad
 from support import paper, sized
 
-from hpgr import flow, geometry
+from hpgr import flow, geometry, machine, stress
 
 SCENES = {
     "paper": {},
@@ -132,7 +133,8 @@ def test_any_machine_gives_finite_falling_points(exponent, entry_fraction, entry
     except ValueError as error:
         assert "flow.entry_fraction" in str(error)  # noqa: PT017 - the only refusal there is
         return
-    assert all(np.all(np.isfinite(part)) for part in motion)
+    assert motion.onset is None  # compaction begins gradually in this profile
+    assert all(np.all(np.isfinite(part)) for part in motion if part is not None)
     assert np.all(np.diff(motion.y) < 0)
     assert np.all(motion.y <= bed.height)
 
@@ -172,3 +174,174 @@ def test_doubling_the_roll_speed_halves_times_and_nothing_else():
     assert np.array_equal(fast.shear_rate, 2 * slow.shear_rate)
     assert np.array_equal(fast.residence_time, slow.residence_time / 2)
     assert fast.time_step == slow.time_step / 2
+
+
+# --- profile "nip" of real machines -------------------------------------------------------------------------
+
+PILOT = {"flow.profile": "nip", "rolls.diameter": 0.8, "rolls.gap": 0.0237, "rolls.entry_gap": 0.06}
+NIPS = {
+    "pilot": PILOT | {"flow.nip_angle": "9.1 deg"},
+    "from the cake": PILOT | {"flow.cake_solid_fraction": 0.85},
+    "steep": PILOT | {"flow.nip_angle": "20 deg", "rolls.entry_gap": 0.2, "rolls.gap": 0.05},
+    "nip at the top": PILOT | {"flow.nip_angle": "12.0 deg", "rolls.gap": 0.06 - 0.8 * (1 - np.cos(np.radians(12.0)))},
+}
+each_nip = pytest.mark.parametrize("values", NIPS.values(), ids=NIPS)
+
+
+def nipped(values, streamlines=3, points=41):
+    return move(values | {"feed.top_size": 0.03}, streamlines, points)
+
+
+def nip_of(scene):
+    return scene.rolls.diameter / 2 * np.sin(flow.nip_angle(scene))
+
+
+def nip_velocity(scene, x, y, below):
+    """The velocity field of the model page, section Real machines, below or above the nip, in x and y alone."""
+    _, outer, slope = half_width(scene)
+    speed, nip = scene.rolls.speed * scene.rolls.diameter / 2, nip_of(scene)
+    tangent = x / outer(y) * slope(y)
+    if below:
+        down = -speed / np.sqrt(1 + tangent**2)
+    else:
+        down = -speed / np.sqrt(1 + (x / outer(y) * slope(nip)) ** 2) * outer(nip) / outer(y)
+    return tangent * down, down
+
+
+def test_nip_angle_of_the_published_worked_case():
+    """Torres & Casali 2009: D 1 m, gap 0.03 m, cake 2.3 and feed 1.6 t/m3; 9.504 degrees with unrounded arithmetic."""
+    cake = {"flow.profile": "nip", "flow.cake_solid_fraction": 2.3 / 2.7, "material.feed_solid_fraction": 1.6 / 2.7}
+    scene = paper({"rolls.diameter": 1.0, "rolls.gap": 0.03, "rolls.entry_gap": 0.1} | cake)
+    assert np.degrees(flow.nip_angle(scene)) == pytest.approx(9.504, abs=5e-4)
+
+
+def test_nip_angle_keeps_mass_from_nip_to_gap():
+    scene = paper(NIPS["from the cake"])
+    angle, rolls = flow.nip_angle(scene), scene.rolls
+    at_nip = scene.material.feed_solid_fraction * (rolls.gap + rolls.diameter * (1 - np.cos(angle))) * np.cos(angle)
+    assert at_nip == pytest.approx(0.85 * rolls.gap, rel=1e-12)
+    assert flow.nip_angle(paper(NIPS["pilot"])) == np.radians(9.1)
+
+
+@each_nip
+def test_nip_strain_rates_are_those_of_the_velocity_field(values):
+    """Gradient by complex steps, which have no rounding of differences, in both zones."""
+    scene, bed, _ = nipped(values)
+    nip, height, h = flow.nip_height(scene, bed), bed.height, 1e-30
+    for below, y in ((True, np.linspace(0, nip, 9)), (False, nip * np.linspace(1.001, 1.1, 9))):
+        y = np.tile(y, (3, 1))
+        x = bed.xi[:, None] * half_width(scene)[1](y)
+        found = flow.velocity_gradient(scene, bed, y, 1 - y / height)
+        unit = scene.rolls.speed * scene.rolls.diameter / 2 / height
+        (xx, yx), (xy, yy) = (
+            [part.imag / h for part in nip_velocity(scene, x + dx, y + dy, below)]
+            for dx, dy in ((1j * h, 0), (0, 1j * h))
+        )
+        scale = max(np.abs(xx).max(), np.abs(yy).max())
+        for name, exact in (("v_xx", xx), ("v_xy", xy), ("v_yx", yx), ("v_yy", yy)):
+            assert unit * getattr(found, name) == pytest.approx(exact, abs=1e-9 * scale), (name, below)
+        if not below:
+            assert xx + yy == pytest.approx(0, abs=1e-12 * scale)  # the feed keeps its density
+
+
+@each_nip
+def test_nip_bed_runs_at_the_speed_of_the_rolls_below_and_keeps_its_flux_above(values):
+    scene, bed, motion = nipped(values, points=201)
+    _, outer, slope = half_width(scene)
+    surface_speed, nip = scene.rolls.speed * scene.rolls.diameter / 2, nip_of(scene)
+    below = motion.y <= nip
+    assert below.any(axis=1).all()
+    assert np.all(motion.speed[below] == surface_speed)
+    # X |v_y| of every tube is that at the nip
+    xi = bed.xi[:, None]
+    flux = outer(motion.y) * motion.speed / np.sqrt(1 + (xi * slope(motion.y)) ** 2)
+    at_nip = outer(nip) * surface_speed / np.sqrt(1 + (xi * slope(nip)) ** 2)
+    assert flux[~below] == pytest.approx(np.broadcast_to(at_nip, flux.shape)[~below], rel=1e-12)
+    assert np.all(motion.volumetric_rate[~below] == 0)
+    assert np.all(motion.volumetric_rate[below & (motion.y > 0)] > 0)
+
+
+@each_nip
+def test_nip_points_are_one_time_step_apart(values):
+    scene, bed, motion = nipped(values, points=sized(21, 9))
+    _, outer, slope = half_width(scene)
+    nip = nip_of(scene)
+    for line in range(3):
+
+        def slowness(y, xi=bed.xi[line]):
+            vx, vy = nip_velocity(scene, xi * outer(y), y, y <= nip)
+            return np.hypot(vx, vy) ** -1 * np.sqrt(1 + (xi * slope(y)) ** 2)
+
+        for upper, lower in zip(motion.y[line, :-1], motion.y[line, 1:], strict=True):
+            kink = [nip] if lower < nip < upper else None
+            assert quad(slowness, lower, upper, epsrel=1e-11, points=kink)[0] == pytest.approx(
+                motion.time_step, rel=1e-7
+            )
+
+
+def strain_error(values, points):
+    """Largest error of the volumetric strain against ln of the tube's density ratio."""
+    scene, bed, motion = nipped(values, points=points)
+    _, outer, slope = half_width(scene)
+    xi, nip = bed.xi[:, None], nip_of(scene)
+
+    def flux(y):
+        return outer(y) / np.sqrt(1 + (xi * slope(y)) ** 2)
+
+    exact = np.log(flux(nip) / flux(np.minimum(motion.y, nip)))
+    volumetric, _ = stress.strain_increments(motion)
+    return np.abs(flow.running_sum(volumetric) - exact).max(), exact.max()
+
+
+@each_nip
+def test_volumetric_strain_is_the_logarithm_of_the_density_ratio(values):
+    points = (101, 201, 401, 801)
+    errors = [strain_error(values, count)[0] for count in points]
+    assert strain_error(values, 801)[1] > 0.3  # a real compaction
+    assert errors[-1] < 1e-5
+    order = np.polyfit(np.log(points), np.log(errors), 1)[0]
+    assert order == pytest.approx(-2, abs=0.25)  # trapezoid rule
+
+
+def test_force_does_not_jump_as_the_nip_crosses_a_point():
+    """The number of points below the nip changes by one between two gaps 1e-13 apart; force and strain do not."""
+
+    def below(gap):
+        scene, _, motion = nipped(NIPS["pilot"] | {"rolls.gap": gap, "resolution.points": 41}, 1)
+        return np.count_nonzero(motion.y <= nip_of(scene)), scene, motion
+
+    gaps = np.linspace(0.020, 0.030, 60)
+    counts = [below(gap)[0] for gap in gaps]
+    crossings = np.flatnonzero(np.diff(counts))
+    assert crossings.size >= 2
+    for k in crossings[:3]:
+        low, high = gaps[k], gaps[k + 1]
+        while high - low > 1e-13:
+            middle = (low + high) / 2
+            low, high = (middle, high) if below(middle)[0] == counts[k] else (low, middle)
+        (first, scene, one), (second, other, two) = below(low), below(high)
+        assert first != second
+        strains = [stress.strain_increments(motion)[0].sum() for motion in (one, two)]
+        assert strains[1] == pytest.approx(strains[0], rel=1e-7)
+        assert machine.pressing_force(other) == pytest.approx(machine.pressing_force(scene), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        (PILOT, r"flow.nip_angle.*\n.*got nothing; profile 'nip' needs either"),
+        (PILOT | {"flow.nip_angle": 0.1, "flow.cake_solid_fraction": 0.8}, "got nip_angle and cake_solid_fraction"),
+        ({"flow.nip_angle": 0.1}, "profile 'power' has no nip; leave it out"),
+        (PILOT | {"flow.cake_solid_fraction": 0.95}, "must lie within feed_solid_fraction 0.6 to max_solid_fraction"),
+        (PILOT | {"flow.cake_solid_fraction": 0.5}, "must lie within feed_solid_fraction 0.6 to"),
+        (
+            PILOT | {"flow.cake_solid_fraction": 0.9, "rolls.gap": 0.3, "rolls.entry_gap": 0.5},
+            "no nip angle feeds so dense a cake; must be at most 0.756; give a lighter cake or a narrower gap",
+        ),
+        (PILOT | {"flow.nip_angle": "20 deg"}, "rolls.entry_gap\n.*at least 71.9.* mm, the roll distance at the nip"),
+        (PILOT | {"flow.nip_angle": "61 deg"}, "must be less than 60 deg"),
+    ],
+)  # fmt: skip
+def test_impossible_nips_are_refused(values, words):
+    with pytest.raises(ValidationError, match=words):
+        nipped(values)

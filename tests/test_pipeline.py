@@ -180,7 +180,7 @@ SIZES = ("size", "breaks_per_cell", "below_floor")
 def test_speed_changes_throughput_and_rates_and_nothing_else():
     slow = simulate(paper())
     fast = simulate(paper({"rolls.speed": 2 * paper().rolls.speed}))
-    rates = {"speed", "throughput", "volumetric_strain_rate", "shear_strain_rate"}
+    rates = {"speed", "throughput", "power", "volumetric_strain_rate", "shear_strain_rate"}
     assert same_bits(slow, fast, set(slow.data_vars) - rates)
     assert all(np.array_equal(fast[name], 2 * slow[name]) for name in rates)
     assert np.array_equal(fast["residence_time"], slow["residence_time"] / 2)
@@ -200,6 +200,7 @@ def test_stress_and_strength_times_8_give_the_same_product(record, cushioning):
     )
     first, second = simulate(scene), simulate(stiff)
     stresses = {name for name in first.data_vars if schema.VARIABLES[name].units == "Pa"}
+    stresses |= {"pressing_force", "torque", "power", "specific_energy"}  # all in proportion to stress
     assert same_bits(first, second, set(first.data_vars) - stresses)
     assert all(np.array_equal(second[name], 8 * first[name]) for name in stresses)
 
@@ -256,7 +257,7 @@ def test_strength_above_every_stress_gives_the_feed_bit_for_bit():
     scene = paper({"material.strength": 1e15})
     ds = simulate(scene)
     assert np.array_equal(product_sizes(ds), feed_sizes(scene))
-    assert flags(ds) == {"no_breakage", "solid_fraction_capped"}
+    assert flags(ds) == {"no_breakage", "solid_fraction_capped", "unusual_machine"}  # rolls of 6 m
     assert "no_breakage: no grain broke: the product is the feed" in ds.attrs["notes"]
     assert not ds["breaks_per_cell"].any()
 

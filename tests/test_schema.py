@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 from support import feed_values, paper
 
-from hpgr import Scene, schema, simulate
+from hpgr import Scene, presets, schema, simulate
 
 RECORDS = ("cells", "distributions", "product", "stress only")
 WITH_EXCHANGE = ("exchange",) if "exchange" in Scene.model_fields else ()
@@ -43,6 +43,9 @@ def test_table_holds_nothing_that_no_simulation_produces():
     produced = set().union(*(set(dataset(record).variables) for record in RECORDS + WITH_EXCHANGE))
     scene = paper({"resolution.record": "product", "material.cushioning": np.inf})
     produced |= set(simulate(scene, tolerance=0.1).variables)
+    produced |= set(simulate(paper({"resolution.record": "product", "roll_width": {}})).variables)
+    held = {"rolls.specific_pressing_force": 2.5e6, "resolution.cells": 0}
+    produced |= set(simulate(presets.khd_pilot().with_values(held)).variables)
     assert produced == set(schema.VARIABLES) | set(schema.COORDINATES)
 
 

@@ -1,5 +1,6 @@
 import errno
 import os
+import re
 import subprocess
 import sys
 
@@ -113,7 +114,7 @@ def test_units_are_units(path):
         for variable in file.variables.values():
             if variable.dtype is not str:
                 # CF writes "kg s-1": a number straight after a unit is its exponent
-                words = [w.replace("-1", "^-1") if w != "1" else w for w in variable.units.split()]
+                words = [re.sub(r"(-?\d+)$", r"^\1", w) if w != "1" else w for w in variable.units.split()]
                 registry.parse_units(" * ".join(words) if words != ["1"] else "")
 
 

@@ -270,6 +270,15 @@ def test_shear_beyond_the_limit_is_taken_as_plastic():
     assert ratio == pytest.approx(math.sqrt(4.5 * ore.shear_modulus / ore.bulk_modulus), rel=1e-9)
 
 
+def test_a_tiny_shear_limit_is_kept_to_the_last_bit():
+    """The plain sum of shear is ten million times the limit, and loses as many digits of it."""
+    soft = {"material.bulk_modulus": 1.0, "material.shear_modulus": 1e12, "material.elastic_exponent": 9.9}
+    scene = paper({**soft, "resolution.cells": 0, "resolution.points": 2001})
+    state = stress.load(scene, flow.move(scene, geometry.bed(scene.rolls, 3), 2001))
+    assert state.on_shear_limit.any()
+    assert np.all(state.shear_strain <= stress.largest_shear_ratio(scene.material) * state.volumetric_strain)
+
+
 def test_solid_fraction_is_capped_and_continuity_told():
     state = stress.load(paper(), motion(np.full(11, 1.0), np.zeros(11), 0.1))
     assert state.solid_fraction.max() == 0.9
@@ -357,12 +366,31 @@ def test_moduli_times_8_give_pressures_times_8(integrator):
     assert np.array_equal(stiff_state.on_shear_limit, soft_state.on_shear_limit)
 
 
-@pytest.mark.parametrize("preset", [presets.paper, presets.khd_pilot])
+# The paper's machine; its flow and sand between pilot rolls; and the pilot's own flow below its nip, whose shear over
+# compaction is 2/3 (uniaxial), within the limit of its ore (1.39) but not of one five times as stiff in shear (0.62).
+ON_SHEAR_LIMIT = {
+    "paper": presets.paper(),
+    "pilot rolls": presets.paper().with_values(
+        {
+            "rolls.diameter": 0.8,
+            "rolls.gap": 0.019,
+            "rolls.entry_gap": 0.163,
+            "feed.top_size": 0.045,
+            "material.feed_solid_fraction": 0.595,
+        }
+    ),
+    "khd_pilot, stiff in shear": presets.khd_pilot().with_values(
+        {"material.shear_modulus": 5 * presets.khd_pilot().material.shear_modulus}
+    ),
+}
+
+
+@pytest.mark.parametrize("preset", ON_SHEAR_LIMIT.values(), ids=ON_SHEAR_LIMIT)
 def test_euler_tends_to_the_limit_of_increment_with_shear_on_its_limit(preset):
     # the total shear rate in place of the elastic one would tend to 27.39 against 26.65 MPa on the paper's machine,
     # and to 6.93 against 3.85 MPa on the pilot rolls
     def peak(integrator, points):
-        scene = preset().with_values({"stress.integrator": integrator, "resolution.points": points})
+        scene = preset.with_values({"stress.integrator": integrator, "resolution.points": points})
         motion = flow.move(scene, geometry.bed(scene.rolls, 2), points)
         state = stress.load(scene, motion)
         assert state.on_shear_limit.any()
@@ -372,3 +400,16 @@ def test_euler_tends_to_the_limit_of_increment_with_shear_on_its_limit(preset):
     coarse, fine = (abs(peak("euler", points) / limit - 1) for points in (801, 6401))
     assert fine < 1e-3
     assert fine < coarse / 4  # first order would be 8
+
+
+def test_bed_of_the_pilot_rolls_stays_off_the_shear_limit():
+    """Below a nip the bed is compacted almost uniaxially: eps_s = 2/3 eps_v, little more at the roll."""
+    scene = presets.khd_pilot()
+    motion = flow.move(scene, geometry.bed(scene.rolls, 10), 201)
+    state = stress.load(scene, motion)
+    assert not state.on_shear_limit.any()
+    increments = stress.strain_increments(motion)
+    ratio = increments[1].sum(axis=1) / increments[0].sum(axis=1)
+    assert np.all(ratio >= 2 / 3)
+    assert ratio[0] == pytest.approx(2 / 3, abs=0.02)
+    assert ratio.max() < stress.largest_shear_ratio(scene.material)

@@ -133,18 +133,19 @@ def test_seed_decides_the_bits(base, client):
     assert not np.array_equal(one["passing"], other["passing"])
 
 
-def test_speed_changes_throughput_only(base, client):
+def test_speed_changes_throughput_and_power_only(base, client):
     speed = 19 * np.pi / 30
     result = sweep(base, {"rolls.speed": [speed, 2 * speed, 4 * speed, 1.37 * speed]}, 2, client=client)
     for name in result.data_vars:
-        if name not in ("throughput", "message"):
+        if name not in ("throughput", "power", "message"):
             first = result[name].isel(roll_speed=0)
             changed = [k for k in range(4) if not np.array_equal(result[name].isel(roll_speed=k), first)]
             assert not changed, name
-    flow = result["throughput"].values
-    assert np.array_equal(flow[1], 2 * flow[0])  # doubling is exact in binary
-    assert np.array_equal(flow[2], 4 * flow[0])
-    assert flow[3] == pytest.approx(1.37 * flow[0], rel=2**-23)  # one rounding of float32
+    for name in ("throughput", "power"):  # in proportion to speed, by energy and mass per roll turn
+        flow = result[name].values
+        assert np.array_equal(flow[1], 2 * flow[0])  # doubling is exact in binary
+        assert np.array_equal(flow[2], 4 * flow[0])
+        assert flow[3] == pytest.approx(1.37 * flow[0], rel=2**-23)  # one rounding of float32
 
 
 def test_other_fields_as_axes(base, client):
@@ -406,3 +407,19 @@ def test_unreachable_scheduler_is_refused(tmp_path, monkeypatch, capsys):
     assert main(["--cells", "60", "--scheduler", "tcp://127.0.0.1:9"]) == 2
     assert "tcp://127.0.0.1:9" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("tolerance", [None, 0.2])
+def test_gap_floats_under_a_swept_pressing_force(client, tolerance):
+    small = {"resolution.points": 40, "resolution.streamlines": 2, "resolution.cells": 50}
+    scene = hpgr.presets.khd_pilot().with_values(small | {"resolution.record": "product"})
+    forces = [2.5e6, 3.5e6, 9e9]
+    result = sweep(scene, {"rolls.specific_pressing_force": forces}, 2, client=client, tolerance=tolerance)
+    assert result["status"].values.tolist() == [[0, 0], [0, 0], [1, 1]]
+    assert "must lie within the reachable" in str(result["message"].values[2, 0])
+    for k in (0, 1):
+        held = scene.with_values({"rolls.specific_pressing_force": forces[k]})
+        alone = hpgr.simulate(held, tolerance=tolerance)
+        for name in ("operating_gap", "specific_pressing_force", "throughput", "power", "p80_total"):
+            assert np.array_equal(result[name].values[k, 0], alone[name].values), name
+        assert result["specific_pressing_force"].values[k] == pytest.approx(forces[k], rel=1e-5)

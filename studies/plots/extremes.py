@@ -3,6 +3,8 @@
 Every cell of a map carries its outcome as a shade and as letters, so that it reads in black and white.
 """
 
+from itertools import pairwise
+
 import numpy as np
 import xarray as xr
 from matplotlib.colors import ListedColormap
@@ -23,7 +25,7 @@ _LETTERS = {  # flag -> letter in a map
 _MEANINGS = {
     "C": "solid fraction capped",
     "N": "single grains nipped",
-    "D": "bed only dilates",
+    "D": "no compaction",
     "B": "no grain breaks",
     "F": "size floor reached",
     "T": "tension held at 0",
@@ -61,9 +63,9 @@ def stability_figure(result: xr.Dataset) -> Figure:
     letters = ", ".join(f"{letter}: {_MEANINGS[letter]}" for letter in _MEANINGS if letter in seen)
     figure.supxlabel(
         f"Letters: {letters}. Refused: outside the range of the field, or too many passes.\n"
-        "Paper's rolls with a bed that begins at a gap of 500 mm; segregation and mixing on. Narrow gaps and small time "
-        "steps bring points closer together: exchange then takes more passes, and below 1 mm too many.\nRoll speed "
-        "changes no outcome. Steps of 1/8 and longer miss the compaction near the gap. Exponents below 0 ask for "
+        "Paper's rolls with a bed that begins at a gap of 500 mm; segregation and mixing on. Narrow gaps and small "
+        "time steps bring points closer together: exchange then takes more passes, and below 1 mm too many.\nRoll "
+        "speed changes no outcome. Steps of 1/8 and longer miss the compaction near the gap. Exponents below 0 ask for "
         "tension at its onset once steps are small enough to see it. No scene ends without a word.",
         fontsize=10,
     )
@@ -111,8 +113,8 @@ def integrator_figure(result: xr.Dataset) -> Figure:
         column[1].set_xlabel("elastic exponent c [-]")
     for panel in panels[:, 0]:
         panel.set_ylabel(panel.get_label())
-    bounds = [f"{100 * low:g} to {100 * high:g} %" for low, high in zip(_ERROR_LEVELS[:-2], _ERROR_LEVELS[1:-1],
-                                                                       strict=True)] + ["above 100 %"]  # fmt: skip
+    percents = [f"{100 * level:g}" for level in _ERROR_LEVELS[:-1]]
+    bounds = [f"{low} to {high} %" for low, high in pairwise(percents)] + [f"above {percents[-1]} %"]
     shades = _error_shades()
     patches = [
         Patch(facecolor=shade, edgecolor="black", label=text) for shade, text in zip(shades, bounds, strict=True)
@@ -121,8 +123,8 @@ def integrator_figure(result: xr.Dataset) -> Figure:
     figure.legend(handles=patches, loc="outside upper center", ncols=len(patches), fontsize=9)
     figure.supxlabel(
         "Largest error of pressure at a material point [% of the largest pressure], against increments at 6,400 time "
-        "steps. T: tension or reverse shear held at 0, flagged.\nHatched: the pressure has no limit: from 3,200 to 6,400 "
-        "steps it still changes by over 2 %; with exponents below 0 it grows with the number of steps.\n"
+        "steps. T: tension or reverse shear held at 0, flagged.\nHatched: the pressure has no limit: from 3,200 to "
+        "6,400 steps it still changes by over 2 %; with exponents below 0 it grows with the number of steps.\n"
         "Paper's rolls; upper row: its bed (entry gap 1,140 mm); lower row: 40 time steps.",
         fontsize=10,
     )

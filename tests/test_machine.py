@@ -1,0 +1,355 @@
+import math
+import re
+
+import numpy as np
+import pytest
+from scipy.integrate import cumulative_simpson, simpson
+from support import paper
+
+from hpgr import Scene, flow, geometry, machine, metrics, operating_gap, pipeline, presets, schema, simulate, stress
+
+SMALL = {
+    "resolution.cells": 0,
+    "resolution.points": 101,
+    "resolution.streamlines": 4,
+    "resolution.record": "product",
+}
+
+
+def pilot(values=None):
+    return presets.khd_pilot().with_values(SMALL | (values or {}))
+
+
+def industrial(values=None):
+    return presets.industrial().with_values(SMALL | (values or {}))
+
+
+def felt(scene):
+    """The machine's figures in double precision."""
+    prepared = pipeline.prepare(scene)
+    throughput = metrics.gap_throughput(scene, float(prepared.state.solid_fraction[:, -1].mean()))
+    return machine.figures(scene, prepared.pressed, throughput)
+
+
+def flags(dataset):
+    return {name for name, mask in schema.FLAGS.items() if int(dataset["flags"]) & mask}
+
+
+# --- independent arithmetic: one tube below the nip, on 4,001 heights -----------------------------------------
+
+
+def tube(scene, xi, heights=4001):
+    """Strain, stress and work along the streamline x = xi X(y) below the nip, from the velocity field alone.
+
+    Derivatives are complex steps of the velocity, tensors are full and turned into the streamline's axes.
+
+    Returns
+    -------
+    (y from nip to gap, normal stress on the streamline, p, q, eps_v, eps_s)
+    """
+    rolls, ore, h = scene.rolls, scene.material, 1e-30
+    bed = geometry.bed(rolls, 1)
+    speed, nip = rolls.speed * rolls.diameter / 2, rolls.diameter / 2 * math.sin(flow.nip_angle(scene))
+
+    def velocity(x, y):
+        tangent = x / bed.outer(y) * bed.slope(y)
+        down = -speed / np.sqrt(1 + tangent**2)
+        return np.array([tangent * down, down])
+
+    # dense towards the nip, where stress begins as a power of strain
+    y = nip * (1 - np.linspace(0, 1, heights) ** 2)
+    x = xi * bed.outer(y)
+    gradient = np.zeros((heights, 3, 3))
+    gradient[:, :2, 0] = (velocity(x + 1j * h, y).imag / h).T
+    gradient[:, :2, 1] = (velocity(x, y + 1j * h).imag / h).T
+    strain = (gradient + gradient.transpose(0, 2, 1)) / 2
+    volumetric = -np.trace(strain, axis1=1, axis2=2)
+    deviator = strain + volumetric[:, None, None] / 3 * np.eye(3)
+    shear = np.sqrt(2 / 3 * (deviator**2).sum(axis=(1, 2)))
+    slowness = np.sqrt(1 + (xi * bed.slope(y)) ** 2) / speed
+    fraction = np.linspace(0, 1, heights)
+    rate = 2 * nip * fraction * slowness  # time per unit of `fraction`
+    eps_v, eps_s = (cumulative_simpson(part * rate, x=fraction, initial=0) for part in (volumetric, shear))
+    c, stiffness = ore.elastic_exponent, (ore.feed_solid_fraction * np.exp(eps_v)) ** 3
+    power = np.where(eps_v > 0, eps_v, 1.0)  # shear comes as fast as compaction, so both vanish at the nip
+    state_p = ore.bulk_modulus * eps_v ** (c + 1) / (c + 1) + 1.5 * ore.shear_modulus * c * power ** (c - 1) * eps_s**2
+    state_q = 3 * ore.shear_modulus * eps_v**c * eps_s
+    between = (stiffness[1:] + stiffness[:-1]) / 2
+    p, q = (np.append(0, np.cumsum(between * np.diff(part))) for part in (state_p, state_q))
+    # stress tensor, coaxial with the strain rate, in axes along and across the streamline
+    direction = deviator / np.where(shear > 0, shear, 1.0)[:, None, None]  # at the gap's middle nothing strains
+    tensor = p[:, None, None] * np.eye(3) - 2 / 3 * q[:, None, None] * direction
+    angle = np.arctan(xi * bed.slope(y))
+    turn = np.zeros((heights, 3, 3))
+    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(angle)
+    turn[:, 0, 1], turn[:, 1, 0], turn[:, 2, 2] = -np.sin(angle), np.sin(angle), 1
+    turned = turn @ tensor @ turn.transpose(0, 2, 1)
+    work = (p * volumetric + q * shear) * bed.outer(y)  # per area dx dy, dx = X dxi
+    return y, turned[:, 0, 0], simpson(work * 2 * nip * fraction, x=fraction), (p, q, eps_v, eps_s)
+
+
+@pytest.mark.parametrize("scene", [pilot(), industrial(), pilot({"material.elastic_exponent": 1.0})],
+                         ids=["pilot", "industrial", "c = 1"])  # fmt: skip
+def test_force_is_the_normal_stress_on_the_roll(scene):
+    y, normal, _, _ = tube(scene, 1.0)
+    exact = -np.trapezoid(normal, y)
+    found = machine.pressing_force(scene.with_values({"resolution.points": 1601}))
+    assert found * scene.rolls.diameter == pytest.approx(exact, rel=1e-5)
+
+
+@pytest.mark.parametrize("scene", [pilot(), industrial()], ids=["pilot", "industrial"])
+def test_power_is_the_integral_of_stress_work_over_the_bed(scene):
+    """Gauss quadrature across the gap, Simpson's along it; the model's tubes are midpoints, of second order."""
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    exact = 2 * sum(w / 2 * tube(scene, (node + 1) / 2)[2] for node, w in zip(nodes, weights, strict=True))
+    fine = scene.with_values({"resolution.points": 801, "resolution.streamlines": 20, "rolls.idle_torque": 0.0})
+    assert pipeline.prepare(fine).pressed.power == pytest.approx(exact, rel=2e-4)
+    assert felt(fine).power == pytest.approx(exact * scene.rolls.width, rel=2e-4)
+
+
+def test_strains_and_stresses_at_the_gap_are_those_of_the_closed_form():
+    scene = pilot({"resolution.points": 1601})
+    bed = geometry.bed(scene.rolls, 1)._replace(xi=np.array([0.0, 1.0]))
+    state = stress.load(scene, flow.move(scene, bed, 1601))
+    for line in (0, 1):
+        p, q, eps_v, _ = (part[-1] for part in tube(scene, float(line))[3])
+        assert state.volumetric_strain[line, -1] == pytest.approx(eps_v, rel=1e-5)
+        assert state.pressure[line, -1] == pytest.approx(p, rel=1e-4)
+        assert state.shear_stress[line, -1] == pytest.approx(q, rel=1e-4)
+
+
+def test_gradient_across_is_the_normal_part_of_the_turned_deviator():
+    generator = np.random.default_rng(3)
+    plane = generator.normal(size=(50, 2, 2))
+    gradient = np.zeros((50, 3, 3))
+    gradient[:, :2, :2] = plane
+    strain = (gradient + gradient.transpose(0, 2, 1)) / 2
+    deviator = strain - np.trace(strain, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
+    shear = np.sqrt(2 / 3 * (deviator**2).sum(axis=(1, 2)))
+    angle = generator.uniform(-1, 1, 50)  # of the streamline from the vertical
+    normal = np.stack([np.cos(angle), -np.sin(angle), np.zeros(50)], axis=1)
+    exact = -np.einsum("ki,kij,kj->k", normal, deviator, normal) / shear
+    found = flow.Gradient(plane[:, 0, 0], plane[:, 0, 1], plane[:, 1, 0], plane[:, 1, 1])
+    assert found.across(np.tan(angle)) == pytest.approx(exact, rel=1e-12)
+    uniaxial = flow.Gradient(*(np.array([value]) for value in (-1.0, 0.0, 0.0, 0.0)))
+    assert uniaxial.across(np.zeros(1)) == pytest.approx(1.0, rel=1e-15)
+    assert np.all(flow.Gradient(*np.zeros((4, 1))).across(np.zeros(1)) == 0)  # a bed at rest
+
+
+def test_power_is_that_of_plates_closing_on_the_bed():
+    """At small angles each column is pressed as by flat plates: P = 2 U times the integral of normal stress X' dy.
+
+    What is left out is of second order in the angle; it falls accordingly.
+    """
+    left = []
+    for degrees in (2.0, 1.0):
+        angle = math.radians(degrees)
+        rise = 2.8 * (1 - math.cos(angle))  # to 1.4 gaps at the nip: a cake of 0.83
+        rolls = {"rolls.diameter": 2.8, "rolls.gap": 2.5 * rise, "rolls.entry_gap": 4 * rise, "rolls.idle_torque": 0.0}
+        scene = pilot(
+            rolls | {"flow.nip_angle": angle, "resolution.points": 401, "feed": {"kind": "single", "size": 1e-3}}
+        )
+        y, normal, _, _ = tube(scene, 1.0)
+        bed = geometry.bed(scene.rolls, 1)
+        surface_speed = scene.rolls.speed * scene.rolls.diameter / 2
+        plates = -2 * surface_speed * np.trapezoid(normal * bed.slope(y), y)
+        left.append(abs(pipeline.prepare(scene).pressed.power / plates - 1))
+    assert left[0] < 0.01
+    assert left[0] / left[1] > 3, left
+
+
+# --- identities ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scene", [pilot(), industrial(), paper(), pilot({"roll_width": {}})],
+                         ids=["pilot", "industrial", "paper", "roll width"])  # fmt: skip
+def test_identities_of_force_torque_power_and_energy(scene):
+    """W = 2000 Fsp sin(beta) / mdot, with W in kWh/t, Fsp in N/mm2, mdot in t s/(h m3)."""
+    bare = felt(scene.with_values({"rolls.idle_torque": 0.0}))
+    mdot = bare.specific_throughput * 3.6  # kg/m3 is t s/(h m3) over 3.6
+    energy = bare.specific_energy / 3.6e6 * 1000
+    assert energy == pytest.approx(
+        2000 * bare.specific_pressing_force / 1e6 * math.sin(bare.force_angle) / mdot, rel=1e-12
+    )
+    rolls = scene.rolls
+    assert bare.torque * rolls.speed == pytest.approx(bare.power, rel=1e-14)
+    assert bare.specific_pressing_force * rolls.diameter * rolls.width == pytest.approx(bare.pressing_force, rel=1e-14)
+    idling = felt(scene.with_values({"rolls.idle_torque": 2e3}))
+    assert idling.power - bare.power == pytest.approx(2e3 * rolls.speed, rel=1e-9)
+    assert idling.torque - bare.torque == pytest.approx(2e3, rel=1e-9)
+    assert idling.specific_energy / bare.specific_energy == pytest.approx(idling.power / bare.power, rel=1e-12)
+    for name in ("pressing_force", "specific_pressing_force", "specific_throughput", "nip_angle", "force_angle"):
+        assert getattr(idling, name) == getattr(bare, name)
+
+
+def test_moduli_times_8_give_force_and_power_times_8():
+    for scene in (pilot({"rolls.idle_torque": 0.0}), paper()):
+        ore = scene.material
+        stiff = scene.with_values(
+            {"material.bulk_modulus": 8 * ore.bulk_modulus, "material.shear_modulus": 8 * ore.shear_modulus}
+        )
+        soft, hard = felt(scene), felt(stiff)
+        for name in ("pressing_force", "specific_pressing_force", "torque", "power", "specific_energy"):
+            assert getattr(hard, name) == 8 * getattr(soft, name) > 0
+        assert (hard.force_angle, hard.nip_angle) == (soft.force_angle, soft.nip_angle)
+        assert machine.pressing_force(stiff) == 8 * machine.pressing_force(scene)
+
+
+def test_speed_times_2_doubles_power_and_throughput_and_nothing_else():
+    for scene in (pilot(), paper()):
+        slow, fast = felt(scene), felt(scene.with_values({"rolls.speed": 2 * scene.rolls.speed}))
+        assert fast._replace(power=slow.power) == slow
+        assert fast.power == 2 * slow.power
+
+
+def test_pressing_force_alone_is_that_of_the_whole_scene():
+    for scene in (
+        pilot(),
+        industrial(),
+        paper(),
+        pilot({"roll_width": {"pressure_drop": 0.9}}),
+        pilot({"stress.substeps": 3}),
+    ):
+        assert machine.pressing_force(scene) == pytest.approx(felt(scene).specific_pressing_force, rel=1e-12)
+
+
+def test_roll_width_takes_its_share_of_force_and_power():
+    """The mean of 1 - kappa u^2 over the width is 1 - kappa/3."""
+    whole = felt(pilot({"rolls.idle_torque": 0.0}))
+    fallen = felt(pilot({"rolls.idle_torque": 0.0, "roll_width": {"pressure_drop": 0.6}}))
+    assert fallen.pressing_force == pytest.approx(0.8 * whole.pressing_force, rel=1e-12)
+    assert fallen.power == pytest.approx(0.8 * whole.power, rel=1e-12)
+    assert fallen.force_angle == pytest.approx(whole.force_angle, rel=1e-12)
+
+
+# --- reports ------------------------------------------------------------------------------------------------
+
+
+def test_usual_machines_are_not_flagged():
+    assert "unusual_machine" not in flags(simulate(pilot()))
+    assert "unusual_machine" not in flags(simulate(industrial()))
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"rolls.idle_torque": 2e5}, r"specific energy .* kWh/t \(usual 1 kWh/t to 3 kWh/t\)"),
+        ({"rolls.gap": "30 mm"}, r"gap over diameter 0.0375 \(usual 0.02 to 0.03\)"),
+        ({"material.bulk_modulus": 6e9, "material.shear_modulus": 3e9}, r"pressing force .* \(usual 1 MPa to 9 MPa\)"),
+        ({"flow.nip_angle": "7 deg"}, r"exit solid fraction 0.7.* \(usual 0.75 to 0.92\)"),
+    ],
+)  # fmt: skip
+def test_unusual_machines_are_flagged_with_figure_and_range(values, words):
+    dataset = simulate(pilot(values))
+    assert "unusual_machine" in flags(dataset)
+    (note,) = (line for line in dataset.attrs["notes"].splitlines() if line.startswith("unusual_machine: "))
+    assert re.search(words, note), note
+
+
+def test_paper_rolls_are_larger_than_usual():
+    assert "roll diameter 6000 mm (usual 500 mm to 2800 mm)" in simulate(paper()).attrs["notes"]
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"rolls.gap": 0.06, "rolls.entry_gap": 0.06}, {"flow.entry_fraction": 0.99}, {"flow.exponent": 5.0}],
+    ids=["equal gaps", "last bit of the bed", "only dilates"],
+)
+def test_a_bed_that_is_not_compacted_presses_nothing(values):
+    dataset = simulate(paper(values | {"resolution.cells": 0}))
+    assert "no_compaction" in flags(dataset)
+    for name in (
+        "pressing_force",
+        "specific_pressing_force",
+        "torque",
+        "power",
+        "specific_energy",
+        "nip_angle",
+        "force_angle",
+    ):
+        assert float(dataset[name]) == 0, name
+    assert float(dataset["throughput"]) > 0
+
+
+def test_power_beyond_any_force_angle_is_flagged_and_the_angle_held():
+    bed = machine.Press(force=1.0, power=1e3, nip_angle=0.1)
+    assert machine.figures(pilot(), bed, 1.0).force_angle == math.pi / 2
+    scene = pilot()
+    prepared = pipeline.prepare(scene)
+    values = pipeline.crush(scene, prepared._replace(pressed=prepared.pressed._replace(force=1.0)), 0, 0)
+    assert values["flags"] & schema.FLAGS["no_force_angle"]
+    assert "force_angle is 90 deg" in values["notes"]
+
+
+# --- floating gap -------------------------------------------------------------------------------------------
+
+FLOATING = {"pilot": pilot(), "industrial": industrial(), "paper": paper({"resolution.cells": 0}),
+            "roll width": pilot({"roll_width": {}})}  # fmt: skip
+floating = pytest.mark.parametrize("scene", FLOATING.values(), ids=FLOATING)
+
+
+@floating
+def test_gap_to_force_and_back(scene):
+    """The nip angle of a cake density is that at the scene's own gap, so it comes back to itself."""
+    force = machine.pressing_force(scene)
+    assert operating_gap(scene, force) == pytest.approx(scene.rolls.gap, rel=2e-9)
+    assert operating_gap(scene, f"{force / 1e6!r} N/mm^2") == pytest.approx(scene.rolls.gap, rel=2e-9)
+
+
+@floating
+def test_gap_falls_with_force_and_carries_it(scene):
+    force = machine.pressing_force(scene)
+    wanted = force * np.array([0.6, 0.8, 1.0, 1.2, 1.4])
+    found = [machine.at_operating_gap(scene.with_values({"rolls.specific_pressing_force": one})) for one in wanted]
+    gaps = [one.rolls.gap for one in found]
+    assert np.all(np.diff(gaps) < 0)
+    assert [machine.pressing_force(one) for one in found] == pytest.approx(wanted, rel=1e-7)
+
+
+def test_gap_floats_with_the_nip_angle_of_its_cake_held():
+    scene = industrial({"rolls.specific_pressing_force": 4e6})
+    found = machine.at_operating_gap(scene)
+    assert found.flow.nip_angle == flow.nip_angle(scene)
+    assert found.flow.cake_solid_fraction is None
+    assert found.rolls.gap != scene.rolls.gap
+    assert Scene.model_validate(found.model_dump()) == found  # the copies made on the way are valid
+
+
+@floating
+def test_operating_gap_is_found_again_bit_for_bit(scene):
+    held = scene.with_values({"rolls.specific_pressing_force": 1.1 * machine.pressing_force(scene)})
+    first = machine.at_operating_gap(held)
+    assert machine.at_operating_gap(held) == first
+    assert machine.at_operating_gap(first) == first
+    assert machine.at_operating_gap(scene) is scene  # no force to hold
+
+
+REACH = (
+    r"rolls.specific_pressing_force: got .*; must lie within the reachable .* MPa \(gap .* mm\) to .* MPa "
+    r"\(gap .* mm, below which .*\); choose a force"
+)
+
+
+@floating
+def test_forces_out_of_reach_are_refused_with_the_reachable_range(scene):
+    nip = scene.flow.profile == "nip"
+    for force in (1.0, 1e12) if nip else (1e12,):  # the paper's bed may also be as good as not pressed
+        with pytest.raises(ValueError, match=REACH) as error:
+            operating_gap(scene, force)
+    # the ends told are true: just inside them a gap is found
+    low, high = (float(one) * 1e6 for one in re.findall(r"([\d.e+-]+) MPa \(gap", str(error.value)))
+    assert (low > 0) == nip
+    assert operating_gap(scene, max(low, 1e3) * 1.001) > operating_gap(scene, high * 0.999)
+
+
+def test_simulate_reports_the_operating_gap_and_keeps_it_in_the_scene():
+    scene = pilot({"rolls.specific_pressing_force": "3.5 N/mm^2"})
+    dataset = simulate(scene)
+    gap = operating_gap(scene, 3.5e6)
+    assert float(dataset["operating_gap"]) == pytest.approx(gap, rel=1e-7)
+    assert float(dataset["specific_pressing_force"]) == pytest.approx(3.5e6, rel=1e-6)
+    kept = Scene.model_validate_json(dataset.attrs["scene"])
+    assert kept.rolls.gap == gap
+    assert kept.rolls.specific_pressing_force == 3.5e6
+    assert simulate(kept).identical(dataset)
+    assert "operating_gap" not in simulate(pilot())
