@@ -192,7 +192,20 @@ def calibrate(
 
 
 def fit_tests(scene: Scene, tests: Sequence[PilotTest], fit: Sequence[str], feed: Feed | None = None) -> Calibration:
-    """Fit parameters of `scene` to tests, as `calibrate` does to those of files."""
+    """Fit parameters of `scene` to tests, as `calibrate` does to those of files.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr import calibration
+    >>> folder = hpgr.presets.DATA
+    >>> tests = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
+    >>> coarse = {"resolution.points": 40, "resolution.streamlines": 1, "material.cushioning": float("inf")}
+    >>> scene = hpgr.presets.khd_pilot().with_values(coarse)
+    >>> found = calibration.fit_tests(scene, tests[:1], ["gamma"])
+    >>> found.estimates["gamma"].low < found.estimates["gamma"].value < found.estimates["gamma"].high
+    True
+    """
     names = _known_names(scene, fit)
     scene = _started(scene.with_values({"resolution.record": "product"}), names, tests[0], feed)
     trial = _Trial(scene, [_at_test(scene, test, feed) for test in tests], tests, names)
@@ -280,6 +293,17 @@ def predict(scene: Scene, test: PilotTest, feed: Feed | None = None, floating: b
 
     With `floating` off, the gap is the test's cake thickness, or its working gap where that was not measured, and the
     force follows instead.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr import calibration
+    >>> folder = hpgr.presets.DATA
+    >>> [first, *_] = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
+    >>> stress_only = hpgr.presets.khd_pilot().with_values({"resolution.cells": 0})
+    >>> said = calibration.predict(stress_only, first)
+    >>> abs(said.power / first.power - 1) < 0.1
+    True
     """
     return _predict(_at_test(scene.with_values({"resolution.record": "product"}), test, feed, floating))
 

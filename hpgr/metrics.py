@@ -97,6 +97,15 @@ def throughput(dataset: xr.Dataset, total: bool = False) -> xr.DataArray:
     """Return the solids through each stream tube of both half gaps, or through the whole gap, kg/s.
 
     Q = rho_s phi_exit s_b L U (model page, section 7), in equal parts.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> dataset = hpgr.simulate(hpgr.presets.paper().with_values({"resolution.cells": 0}))
+    >>> round(float(hpgr.throughput(dataset, total=True)) * 3.6)  # t/h
+    3075
+    >>> hpgr.throughput(dataset).dims
+    ('streamline',)
     """
     if total:
         return dataset["throughput"]
@@ -110,6 +119,13 @@ def peak_pressure(dataset: xr.Dataset, total: bool = False) -> xr.Dataset:
     """Return the largest mean stress (Pa) and its height above the minimum gap (m), as a Dataset.
 
     Variables `peak_pressure` and `peak_pressure_height`, per streamline or of the whole bed.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> dataset = hpgr.simulate(hpgr.presets.paper().with_values({"resolution.cells": 0}))
+    >>> round(float(hpgr.peak_pressure(dataset, total=True)["peak_pressure"]) / 1e6, 1)  # MPa
+    26.5
     """
     names = ("peak_pressure", "peak_pressure_height")
     return xr.Dataset({name: dataset[name if total else f"streamline_{name}"] for name in names})
@@ -124,6 +140,13 @@ def reduction_ratio(dataset: xr.Dataset, percent: float = 80, total: bool = Fals
     ------
     ValueError
         If the Dataset is of a sweep over the feed, whose scene has one feed only.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> dataset = hpgr.simulate(hpgr.presets.paper().with_values({"material.cushioning": float("inf")}))
+    >>> 25 < float(hpgr.reduction_ratio(dataset, 80, total=True)) < 40
+    True
     """
     swept = [name for name, axis in dataset.coords.items() if axis.attrs.get("scene_field", "").startswith("feed.")]
     if swept:
@@ -138,7 +161,15 @@ def reduction_ratio(dataset: xr.Dataset, percent: float = 80, total: bool = Fals
 
 
 def gap_throughput(scene: Scene, exit_solid_fraction: float) -> float:
-    """Return the solids through the whole gap, Q = rho_s phi_exit s_b L U, kg/s."""
+    """Return the solids through the whole gap, Q = rho_s phi_exit s_b L U, kg/s.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr import metrics
+    >>> round(metrics.gap_throughput(hpgr.presets.paper(), exit_solid_fraction=0.9), 1)  # kg/s
+    854.2
+    """
     rolls = scene.rolls
     surface_speed = rolls.speed * rolls.diameter / 2
     return scene.material.solid_density * exit_solid_fraction * rolls.gap * rolls.width * surface_speed
@@ -198,6 +229,14 @@ def between_sieves(found: xr.DataArray, wanted: np.ndarray) -> xr.DataArray:
     ------
     ValueError
         If a size lies outside the recorded sieves.
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> from hpgr import metrics
+    >>> found = xr.DataArray([0.2, 0.6], {"sieve": [1e-3, 4e-3]}, "sieve")
+    >>> metrics.between_sieves(found, np.array([2e-3])).values.round(3)
+    array([0.4])
     """
     known = found["sieve"].values
     outside = wanted[(wanted < known[0]) | (wanted > known[-1])]

@@ -247,7 +247,15 @@ def _explained(cls: type[_Frozen], error: Any) -> InitErrorDetails:
 
 
 class Rolls(_Frozen):
-    """Two equal counter-rotating rolls and the bed between them (paper section 2.2, figure 1)."""
+    """Two equal counter-rotating rolls and the bed between them (paper section 2.2, figure 1).
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> rolls = hpgr.Rolls(diameter="0.8 m", width="25 cm", gap=0.019, entry_gap="60 mm", speed="16 rpm")
+    >>> round(rolls.speed, 3)  # rad/s
+    1.676
+    """
 
     diameter: Metres = _field(
         "D", "m", "Roll diameter", "machine", "give the roll diameter, such as '0.8 m'", ge=1e-3, le=1e3
@@ -306,7 +314,14 @@ class Rolls(_Frozen):
 
 
 class Material(_Frozen):
-    """Ore: density, strength, fragments and the elasticity of the bed. Defaults: the paper's quartz."""
+    """Ore: density, strength, fragments and the elasticity of the bed. Defaults: the paper's quartz.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> hpgr.Material(strength="2 MPa", cushioning=float("inf")).strength
+    2000000.0
+    """
 
     solid_density: Density = _field(
         "rho_s", "kg m-3", "Density of the grains", "quartz, 2650 kg/m3", "weigh the ore, such as 2700",
@@ -387,6 +402,12 @@ class Feed(_Frozen):
     - "rosin_rammler": passing = 1 - exp(-(s / size)**exponent), renormalised below top_size
     - "table": sieve table, linear in log size; rows (size, percent passing) or the path of a CSV file;
       top_size, if given, scalps the table there
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> hpgr.Feed(kind="table", table=[("1 mm", 10), ("5 mm", 60), ("20 mm", 100)]).coarsest
+    0.02
     """
 
     kind: Literal["uniform", "single", "power_law", "rosin_rammler", "table"] = Field(
@@ -486,7 +507,14 @@ def _table_faults(table: tuple[tuple[float, float], ...], top_size: float | None
 
 
 class Flow(_Frozen):
-    """How the bed moves between the rolls (paper section 2.2; profiles ours)."""
+    """How the bed moves between the rolls (paper section 2.2; profiles ours).
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> round(hpgr.Flow(profile="nip", nip_angle="9 deg").nip_angle, 3)  # rad
+    0.157
+    """
 
     profile: Literal["power", "nip"] = Field(
         "power",
@@ -545,7 +573,14 @@ class RollWidth(_Frozen):
 
 
 class Stress(_Frozen):
-    """How granular elasticity is integrated and which stress crushes (paper eqs. 1 and 4)."""
+    """How granular elasticity is integrated and which stress crushes (paper eqs. 1 and 4).
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> hpgr.Stress(integrator="euler").crushing
+    'mean'
+    """
 
     integrator: Literal["increment", "euler"] = Field(
         "increment",
@@ -561,7 +596,14 @@ class Stress(_Frozen):
 
 
 class Exchange(_Frozen):
-    """Segregation and mixing between neighbouring material points, by swaps of cells (paper eq. 3; closure ours)."""
+    """Segregation and mixing between neighbouring material points, by swaps of cells (paper eq. 3; closure ours).
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> hpgr.presets.paper().with_values({"exchange": hpgr.Exchange(mixing=0)}).exchange.segregation
+    0.1
+    """
 
     segregation: Number = _field(
         "A", "1", "Percolation velocity over shear rate and size difference: large grains rise, small ones sink",
@@ -618,6 +660,12 @@ class Resolution(_Frozen):
     """How finely the scene is computed, and what is kept of it.
 
     `level` names a measured choice of streamlines, points and cells, which are then not given.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> hpgr.Resolution(level="fine").points
+    800
     """
 
     level: Literal["custom", "draft", "standard", "fine"] = Field(
@@ -741,6 +789,16 @@ class Scene(_Frozen):
             If the file cannot be read.
         ValueError
             If it is neither TOML nor JSON, or not a scene (pydantic.ValidationError, every fault listed).
+
+        Examples
+        --------
+        >>> from tempfile import TemporaryDirectory
+        >>> import hpgr
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "mine.json"
+        ...     _ = path.write_text(hpgr.presets.paper().model_dump_json())
+        ...     hpgr.Scene.from_file(path) == hpgr.presets.paper()
+        True
         """
         path = Path(path)
         text = path.read_text(encoding="utf-8")

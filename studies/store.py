@@ -19,6 +19,17 @@ def write_dataset(dataset: xr.Dataset, path: str | Path) -> None:
     ------
     OSError
         If it cannot be written; a file that stood at `path` before is left as it was.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from studies.store import write_dataset
+    >>> dataset = hpgr.simulate(hpgr.presets.paper().with_values({"resolution.cells": 0}))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_dataset(dataset, Path(folder) / "stresses.nc")
+    ...     with xr.open_dataset(Path(folder) / "stresses.nc") as read:
+    ...         read["pressure"].dims
+    ('streamline', 'point')
     """
     if "time" in dataset.dims:
         dataset = dataset.rename(time="photograph")

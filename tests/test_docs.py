@@ -1,7 +1,10 @@
 """The documents: every block of Python runs and prints what it says, every command line is taken by its study."""
 
 import dataclasses
+import doctest
 import importlib
+import importlib.util
+import inspect
 import io
 import re
 import shlex
@@ -13,6 +16,8 @@ import pytest
 import tyro
 from support import SCENE_TOML
 
+import hpgr
+from hpgr import schema
 from hpgr.scene import Scene
 from studies import gap_sweep
 
@@ -121,14 +126,10 @@ def test_studies_take_the_commands(page, folder, monkeypatch, capsys):
     monkeypatch.setattr(tyro, "cli", stop)
     Path("mine.toml").write_text(SCENE_TOML)
     for study, arguments in commands(page):
-        try:
+        with pytest.raises((Parsed, SystemExit)) as ended:
             importlib.import_module(f"studies.{study}").main(arguments)
-        except Parsed:
-            continue
-        except SystemExit as end:
-            assert end.code == 0, (study, arguments, capsys.readouterr())  # --help
-            continue
-        pytest.fail(f"{page.name}: {study} {arguments} was not parsed")
+        helped = "--help" in arguments and getattr(ended.value, "code", 1) == 0
+        assert helped or ended.type is Parsed, (study, arguments, capsys.readouterr())
 
 
 def test_there_are_commands_to_take():
@@ -144,7 +145,9 @@ def test_options_named_in_the_text_are_known():
         known |= {"--" + field.name.replace("_", "-") for field in dataclasses.fields(options)} if options else set()
     for page in PAGES:
         prose = re.sub(r"^```.*?^```", "", text_of(page), flags=re.MULTILINE | re.DOTALL)
-        named = {name for code in re.findall(r"`([^`\n]+)`", prose) for name in re.findall(r"(?<![\w-])--[a-z-]+", code)}
+        named = {
+            name for code in re.findall(r"`([^`\n]+)`", prose) for name in re.findall(r"(?<![\w-])--[a-z-]+", code)
+        }
         assert named <= known, (page.name, named - known)
 
 
@@ -153,3 +156,51 @@ def test_links_lead_somewhere():
         for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text_of(page)):
             if not target.startswith("http"):
                 assert (page.parent / target).exists(), (page.name, target)
+
+
+@pytest.fixture(scope="module")
+def api():
+    spec = importlib.util.spec_from_file_location("api", DOCS / "api.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_api_page_is_up_to_date(api):
+    assert text_of(api.PAGE) == api.page(), "run: python docs/api.py"
+
+
+def test_api_page_has_every_field_variable_and_flag(api):
+    page = text_of(api.PAGE)
+    for name, part in Scene.model_fields.items():
+        known = getattr(part.annotation, "model_fields", None) or {}
+        assert all(f"| `{name}.{key}` |" in page for key in known)
+    assert "| `rolls.gap` | `s_b` | m | required | ≥ 1e-06, ≤ 1000 | Gap where the rolls are closest |" in page
+    assert "| `material.strength` | `sigma_m` | Pa | 0.84 MPa | ≥ 1, ≤ 1e+15 |" in page
+    for name in (*schema.VARIABLES, *schema.COORDINATES, *schema.FLAGS):
+        assert f"| `{name}` |" in page
+    assert all(f"### `{name}" in page for name in hpgr.__all__)
+
+
+def needs_example(name, thing):
+    """Public functions need one, and the classes of the public face; what functions return does not."""
+    return inspect.isfunction(thing) or name.count(".") == 1
+
+
+def test_every_public_function_has_an_example(api):
+    public = dict(api.listed())
+    public |= {"hpgr.Scene.from_file": Scene.from_file, "hpgr.Scene.with_values": Scene.with_values}
+    wanted = {name: thing for name, thing in public.items() if needs_example(name, thing)}
+    assert len(wanted) > 50
+    missing = [name for name, thing in wanted.items() if ">>> " not in (inspect.getdoc(thing) or "")]
+    assert not missing, "give these an Examples section"
+    skipped = [name for name, thing in wanted.items() if "+SKIP" in inspect.getdoc(thing)]
+    assert not skipped, "these examples do not run"
+
+
+@pytest.mark.parametrize("name", ["studies.sweep", "studies.store"])
+def test_examples_of_studies(name):
+    """Those of hpgr run in tests/test_pipeline.py."""
+    found = doctest.testmod(importlib.import_module(name))
+    assert found.failed == 0
+    assert found.attempted > 3
