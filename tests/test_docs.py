@@ -105,10 +105,19 @@ def test_readme_runs(folder, capfd):
     run(ROOT / "README.md")
 
 
+def code(page):
+    """Return the lines of fenced and indented blocks, and the code within the text, its line breaks undone."""
+    fenced = re.findall(r"^```.*?\n(.*?)^```", text_of(page), re.MULTILINE | re.DOTALL)
+    prose = re.sub(r"^```.*?^```", "", text_of(page), flags=re.MULTILINE | re.DOTALL)
+    inline = [" ".join(one.split()) for one in re.findall(r"`([^`]+)`", prose)]
+    return "".join(fenced).splitlines(), re.findall(r"^    (\S.*)", prose, re.MULTILINE), inline
+
+
 def commands(page):
-    """Return (study, arguments) of every command line on a page, in blocks or in the text."""
-    found = re.findall(r"python -m studies\.(\w+)([^`\n&|]*)", text_of(page))
-    return [(study, shlex.split(rest, comments=True)) for study, rest in found]
+    """Return (study, arguments) of every command line on a page; a study named without any is none."""
+    found = [re.findall(r"python -m studies\.(\w+)([^&|]*)", line) for part in code(page) for line in part]
+    split = [(study, shlex.split(rest, comments=True)) for line in found for study, rest in line]
+    return [(study, arguments) for study, arguments in split if arguments]
 
 
 class Parsed(BaseException):
@@ -138,17 +147,20 @@ def test_there_are_commands_to_take():
 
 
 def test_options_named_in_the_text_are_known():
-    """Every --option in inline code is one of a study's, or of pip's and pytest's."""
-    known = {"--help", "--no-plot"}
+    known = {"--help"}
     for path in (ROOT / "studies").glob("*.py"):
         options = getattr(importlib.import_module(f"studies.{path.stem}"), "Options", None)
-        known |= {"--" + field.name.replace("_", "-") for field in dataclasses.fields(options)} if options else set()
+        for field in dataclasses.fields(options) if options else ():
+            known |= {f"--{no}{field.name.replace('_', '-')}" for no in ("", "no-")}
     for page in PAGES:
-        prose = re.sub(r"^```.*?^```", "", text_of(page), flags=re.MULTILINE | re.DOTALL)
-        named = {
-            name for code in re.findall(r"`([^`\n]+)`", prose) for name in re.findall(r"(?<![\w-])--[a-z-]+", code)
-        }
+        named = {name for one in code(page)[-1] for name in re.findall(r"(?<![\w-])--[a-z-]+", one)}
         assert named <= known, (page.name, named - known)
+
+
+def test_studies_named_are_there():
+    for page in PAGES:
+        for study in re.findall(r"studies\.(\w+)", text_of(page)):
+            assert importlib.util.find_spec(f"studies.{study}"), (page.name, study)
 
 
 def test_links_lead_somewhere():
