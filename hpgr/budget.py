@@ -9,9 +9,12 @@ import psutil
 from hpgr.scene import Scene
 
 _SHARE = 0.8  # of the available memory that one scene may take; the rest is for the reader of the result
-_CGROUP_FILES = (  # (limit, in use), version 2 and 1
-    ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-    ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
+_NO_LIMIT = 2**60  # bytes; version 1 writes "no limit" as a number near 2**63
+_PROCESS = Path("/proc/self/cgroup")  # where the system tells the control groups of this process
+_CGROUPS = (  # of version 1 (its memory controller), version 2, and version 2 beside version 1
+    (Path("/sys/fs/cgroup/memory"), "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+    (Path("/sys/fs/cgroup"), "memory.max", "memory.current", "inactive_file"),
+    (Path("/sys/fs/cgroup/unified"), "memory.max", "memory.current", "inactive_file"),
 )
 
 
@@ -54,15 +57,53 @@ def predict(scene: Scene) -> Cost:
 
 
 def available_memory() -> tuple[int, str]:
-    """Return the memory left for this process in bytes, and the name of the limit that sets it."""
+    """Return the memory left for this process in bytes, and the name of the limit that sets it.
+
+    A process is bound by its own control group and by every one above it. What files have left in the cache counts as
+    free: the system drops it when memory is asked for.
+    """
     limits = [(psutil.virtual_memory().available, "physical memory")]
-    for limit_file, used_file in _CGROUP_FILES:
-        try:
-            limit, used = int(Path(limit_file).read_text()), int(Path(used_file).read_text())
-        except (OSError, ValueError):  # no such cgroup, or "max"
-            continue
-        limits.append((limit - used, "the cgroup's memory limit"))
+    for root, *files in _CGROUPS:
+        for group in _own_groups():
+            left = _left_in(root / group, *files)
+            if left is not None:
+                limits.append((left, f"the memory limit of cgroup /{'/'.join(group.parts)}"))
     return min(limits)
+
+
+def _own_groups() -> list[Path]:
+    """Return the control groups of this process, each with those above it, relative to where they are mounted."""
+    groups = {Path()}
+    try:
+        lines = _PROCESS.read_text().splitlines()
+    except OSError:  # no Linux
+        return [Path()]
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        if controllers in ("", "memory") or "memory" in controllers.split(","):
+            own = Path(path.lstrip("/"))
+            groups |= {own, *own.parents}
+    return sorted(group for group in groups if ".." not in group.parts)
+
+
+def _left_in(group: Path, limit_file: str, used_file: str, cache: str) -> int | None:
+    """Return the bytes left in a control group, or None if it has no limit."""
+    try:
+        limit = int((group / limit_file).read_text())
+        if limit >= _NO_LIMIT:
+            return None
+        used = int((group / used_file).read_text())
+    except (OSError, ValueError):  # no such group, or "max"
+        return None
+    return max(0, limit - max(0, used - _cached(group, cache)))
+
+
+def _cached(group: Path, name: str) -> int:
+    try:
+        counts = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+        return int(counts.get(name, 0))
+    except (OSError, ValueError):
+        return 0
 
 
 def refuse_too_large(scene: Scene, room: tuple[int, str] | None = None) -> None:

@@ -69,7 +69,7 @@ PARAMETERS = {
     "K": Parameter("material.bulk_modulus", 1e5, 1e12, follower="material.shear_modulus"),
     "alpha": Parameter("flow.nip_angle", math.radians(1), math.radians(45)),
     "kappa": Parameter("roll_width.pressure_drop", 0.0, 1.0, logarithmic=False),
-    "T_0": Parameter("rolls.idle_torque", 0.0, 1e5, logarithmic=False),
+    "T_0": Parameter("rolls.idle_torque", 0.0, 1e6, logarithmic=False),
 }
 
 

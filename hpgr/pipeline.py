@@ -212,8 +212,10 @@ def _notes(scene: Scene, prepared: Prepared, crushed: solve.Crushed | None) -> d
         )
     if state.tension_clamped:
         notes["tension_clamped"] = "the elastic law asked for tension or reverse shear; stresses were held at 0 there"
-        if ore.elastic_exponent < 0:
-            notes["tension_clamped"] += ", and with elastic_exponent below 0 need not converge as time steps shrink"
+    if ore.elastic_exponent < 0 and state.pressure.any():
+        notes["no_limit_of_steps"] = (
+            f"with elastic_exponent {ore.elastic_exponent:g}, below 0, stresses need not converge as time steps shrink"
+        )
     _, felt = _felt(scene, prepared)
     unusual = machine.unusual(scene, felt, float(state.solid_fraction[:, -1].mean()))
     if unusual:

@@ -767,7 +767,8 @@ class Scene(_Frozen):
         if known.get("roll_width.slices") and known.get("exchange.interval"):
             yield Fault("roll_width", "slices", "exchange between streamlines is not simulated slice by slice",
                         "leave roll_width or exchange out")  # fmt: skip
-        if known.get("roll_width.slices") and known.get("resolution.record", "product") != "product":
+        whole = known.get("resolution.record", "product") != "product" and known.get("resolution.cells") != 0
+        if known.get("roll_width.slices") and whole:
             yield Fault("resolution.record", repr(known["resolution.record"]), "roll_width keeps the product only",
                         "take record = 'product', or leave roll_width out")  # fmt: skip
         table, top_size = known.get("feed.table"), known.get("feed.top_size")

@@ -104,6 +104,7 @@ FLAGS = {
     "tension_clamped": 64,
     "unusual_machine": 128,
     "no_force_angle": 256,
+    "no_limit_of_steps": 512,
 }
 
 

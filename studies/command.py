@@ -17,7 +17,12 @@ from hpgr.scene import Scene, faults_of, field_info
 if TYPE_CHECKING:
     import xarray as xr
 
-AXES = {"gap": "rolls.gap", "roll_speed": "rolls.speed", "feed_top_size": "feed.top_size"}
+AXES = {
+    "gap": "rolls.gap",
+    "press_force": "rolls.specific_pressing_force",
+    "roll_speed": "rolls.speed",
+    "feed_top_size": "feed.top_size",
+}
 
 
 class Study(NamedTuple):
@@ -42,6 +47,8 @@ class Options:
 
     gap: Annotated[tuple[str, ...] | None, shown_as("LENGTH ...")] = None
     """Gaps to sweep, such as --gap "40 mm" "60 mm"."""
+    press_force: Annotated[tuple[str, ...] | None, shown_as("PRESSURE ...")] = None
+    """Specific pressing forces F/(D L) to sweep, such as --press-force "2.5 N/mm^2" "4 N/mm^2"; the gap then floats."""
     roll_speed: Annotated[tuple[str, ...] | None, shown_as("SPEED ...")] = None
     """Roll speeds to sweep, such as --roll-speed "15 rpm" "19 rpm"."""
     feed_top_size: Annotated[tuple[str, ...] | None, shown_as("LENGTH ...")] = None
@@ -70,14 +77,20 @@ class Options:
     """Running dask scheduler to use instead, such as tcp://127.0.0.1:8786."""
     exchange: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Switch on segregation and mixing between streamlines, as the scene says, or else with default strength."""
+    record: Literal["product", "distributions", "cells"] = "product"
+    """What is kept of every case beside its summary: a file of distributions or cells, for studies.open_cases."""
+    timeout: Annotated[float | None, shown_as("SECONDS")] = None
+    """Time that a case may take; cases then run in processes of their own, and one that hangs or dies is named."""
+    force: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Compute every case, also those that are finished already in <out>.cases."""
     seed: Annotated[int, shown_as("N")] = 0
     """Seed of all randomness; the same seed gives the same bits."""
     out: Annotated[Path | None, shown_as("FILE")] = None
-    """NetCDF file to write (default: outputs/<study>.nc); the figure goes beside it as .png."""
+    """NetCDF file to write (default: outputs/<study>.nc); beside it the figure, .png, and finished cases, .cases."""
     plot: bool = True
     """Draw the figure, or not."""
     dry_run: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """List the cases with their predicted memory and time, and run none."""
+    """List the cases with their predicted memory and time, say which are finished already, and run none."""
 
 
 def refusing(command: Callable[..., int]) -> Callable[..., int]:
@@ -91,6 +104,9 @@ def refusing(command: Callable[..., int]) -> Callable[..., int]:
             message = "the scene is refused:\n  " + faults_of(error, separator="\n  ")
         except (OSError, ValueError, MemoryError) as error:
             message = str(error)
+        except KeyboardInterrupt:
+            print("interrupted; finished cases are kept, and the same command goes on from there", file=sys.stderr)
+            return 130
         print(f"error: {message}", file=sys.stderr)
         return 2
 
@@ -108,20 +124,23 @@ def run(study: Study, arguments: Sequence[str] | None = None) -> int:
     scene = base_scene(options.scene, **{name: value for name, value in chosen.items() if value is not None})
     if options.exchange and scene.exchange is None:
         scene = scene.with_values({"exchange": {}})
+    study = _floating(study, options)
     axes = _axes(study, options, scene)
     sieve = _sieve(options, scene)
     if min(options.workers, options.replicates) < 1:
         raise ValueError(f"got --workers {options.workers} --replicates {options.replicates}; both must be at least 1")
     refuse_key("--seed", options.seed)
     _check_tolerance(options)
+    if options.timeout is not None and not 0.1 <= options.timeout <= 1e6:
+        raise ValueError(f"--timeout: got {options.timeout:g}; must be 0.1 to 1,000,000 s; such as 60")
     if options.dry_run:
-        _print_cases(scene, axes, options)
+        _print_cases(scene, axes, options, _folder(study, options))
         return 0
     from studies import store
 
     out = _out(study, options)
     store.probe(out)
-    result = _sweep(scene, axes, options)
+    result = _sweep(scene, axes, options, _folder(study, options))
     result.attrs["history"] = _command_line(study, arguments)
     return _report(study, options, result, sieve, out)
 
@@ -158,6 +177,15 @@ def base_scene(name: str, **resolution: int | str) -> Scene:
             f"--scene: got {name!r}; must be a preset ({', '.join(presets.PRESETS)}) or a .toml or .json file"
         )
     return scene.with_values({f"resolution.{key}": value for key, value in resolution.items()})
+
+
+def _floating(study: Study, options: Options) -> Study:
+    """Return a study of the gap as one of the pressing force, if forces are given: the gap then floats."""
+    if study.main != "gap" or options.press_force is None:
+        return study
+    if options.gap is not None:
+        raise ValueError("--gap: got it beside --press-force, under which the gap floats; give one of them")
+    return study._replace(main="press_force", caption="The gap floats under the pressing force; the nip angle is held.")
 
 
 def _axes(study: Study, options: Options, scene: Scene) -> dict[str, list]:
@@ -197,7 +225,7 @@ def _sieve(options: Options, scene: Scene) -> float:
     return sieve
 
 
-def _sweep(scene: Scene, axes: dict[str, list], options: Options) -> "xr.Dataset":
+def _sweep(scene: Scene, axes: dict[str, list], options: Options, folder: Path) -> "xr.Dataset":
     from studies.sweep import sweep
 
     common = {
@@ -206,6 +234,10 @@ def _sweep(scene: Scene, axes: dict[str, list], options: Options) -> "xr.Dataset
         "replicates": options.replicates,
         "seed": options.seed,
         "progress": True,
+        "folder": folder,
+        "force": options.force,
+        "timeout": options.timeout,
+        "record": options.record,
     }
     if options.scheduler is None:
         return sweep(scene, axes, threads=options.workers, **common)
@@ -215,26 +247,35 @@ def _sweep(scene: Scene, axes: dict[str, list], options: Options) -> "xr.Dataset
         return sweep(scene, axes, client=client, **common)
 
 
-def _print_cases(scene: Scene, axes: dict[str, list], options: Options) -> None:
-    from studies.sweep import enumerate_cases
+def _print_cases(scene: Scene, axes: dict[str, list], options: Options, folder: Path) -> None:
+    from studies.sweep import enumerate_cases, finished_cases
 
+    scene = scene.with_values({"resolution.record": options.record})
+    kept = finished_cases(scene, axes, options.replicates, folder, options.seed, options.tolerance, options.max_cost)
+    if options.force:
+        kept = dict.fromkeys(kept, 0)
+    shows_kept = any(kept.values())
     print(f"{scene}\n")
     names = list(axes)
-    print("".join(f"{_heading(name):>24}" for name in names) + f"{'memory':>12}{'time':>12}")
+    heading = "".join(f"{_heading(name):>24}" for name in names) + f"{'memory':>12}{'time':>12}"
+    print(heading + (f"{'finished':>14}" if shows_kept else ""))
     total = 0.0
     for case in enumerate_cases(axes, 1):
         shown = "".join(f"{units.show(case.values[name], field_info(name).unit):>24}" for name in names)
         try:
-            cost = budget.predict(scene.with_values({**case.values, "resolution.record": "product"}))
+            cost = budget.predict(scene.with_values(case.values))
         except ValidationError as error:
             print(f"{shown}  refused: {faults_of(error)}")
             continue
-        total += cost.seconds * options.replicates
-        print(f"{shown}{cost.bytes / 1e6:>9.1f} MB{cost.seconds * 1e3:>9.1f} ms")
+        done = kept[case.index[:-1]]
+        total += cost.seconds * (options.replicates - done)
+        told = f"{f'{done} of {options.replicates}':>14}" if shows_kept else ""
+        print(f"{shown}{cost.bytes / 1e6:>9.1f} MB{cost.seconds * 1e3:>9.1f} ms{told}")
     if options.tolerance is not None:
         print(f"\nbefore refinement: --tolerance {options.tolerance:g} chooses points and cells when a case is run")
-    count = options.replicates * sum(1 for _ in enumerate_cases(axes, 1))
-    print(f"\n{count} cases ({options.replicates} replicates each), about {total / options.workers:.2g} s on "
+    count, done = options.replicates * len(kept), sum(kept.values())
+    finished = f"{done} of them finished already in {folder}; the others " if done else ""
+    print(f"\n{count} cases ({options.replicates} replicates each), {finished}about {total / options.workers:.2g} s on "
           f"{options.workers} threads, plus start-up")  # fmt: skip
 
 
@@ -270,6 +311,11 @@ def _report(study: Study, options: Options, result: "xr.Dataset", sieve: float, 
 def _out(study: Study, options: Options) -> Path:
     out = options.out or Path("outputs") / f"{study.name}.nc"
     return out if out.suffix == ".nc" else out.with_name(out.name + ".nc")
+
+
+def _folder(study: Study, options: Options) -> Path:
+    """Return where finished cases are kept."""
+    return _out(study, options).with_suffix(".cases")
 
 
 def _caption(study: Study, result: "xr.Dataset") -> str:

@@ -1,54 +1,41 @@
 """Axes x replicates -> cases -> dask futures -> one Dataset.
 
-A case is one scene with one replicate number. Cases are sent to dask in batches, and whatever a case does,
-only its own place in the result is left NaN, with its status and message beside it.
+A case is one scene with one replicate number. Finished cases are kept in a folder, if one is given, and read back
+instead of being computed again. Whatever a case does, only its own place in the result is left NaN, with its status
+and message beside it.
 """
 
 import itertools
 import sys
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import ValidationError
 
 import hpgr
-from hpgr import budget, machine, pipeline, schema
-from hpgr import tolerance as tolerances
+from hpgr import budget, schema
 from hpgr.keys import refuse_key
-from hpgr.scene import Scene, faults_of, field_info, field_value, level_text
+from hpgr.scene import Scene, field_info, field_value, level_text
+from studies import recorded, runner
+from studies.bench import LIBRARIES, STATUS, Case, Job, Outcome
+from studies.cases import Addresses, CaseFolder, code_version, outcome_of, read_folder, say
 
 if TYPE_CHECKING:
     import xarray as xr
 
-_LIBRARIES = ("numpy", "numba", "xarray", "netCDF4", "dask", "distributed", "scipy")  # that decide the bits
-
-STATUS = {"ok": 0, "refused": 1, "failed": 2}  # refused: bad input; failed: anything else
-
 # Names of the dims of the main axes (design page); others are called after their field.
-_DIMS = {"rolls.gap": "gap", "rolls.speed": "roll_speed", "feed.top_size": "feed_top_size"}
+_DIMS = {
+    "rolls.gap": "gap", "rolls.speed": "roll_speed", "feed.top_size": "feed_top_size",
+    "rolls.specific_pressing_force": "press_force",
+}  # fmt: skip
 _BATCH = 32  # cases a task holds at most: dask's cost of about 1 ms per task is then under 1 % of a case's
 _BATCH_SECONDS = 2.0  # predicted for a task at most, so that progress shows and little is lost with a worker
-
-
-class Case(NamedTuple):
-    """One scene to run: where its result belongs, and the values that make it."""
-
-    index: tuple[int, ...]
-    values: dict[str, Any]
-    replicate: int
-
-
-class Outcome(NamedTuple):
-    """What became of a case: its summary by variable name and the limits it hit, or why there is none."""
-
-    index: tuple[int, ...]
-    status: str
-    message: str
-    summary: dict[str, tuple[tuple[str, ...], np.ndarray]]
-    notes: str = ""
+_PREDICTED = 100  # operating points whose cost is predicted; that of more is scaled up
 
 
 def sweep(
@@ -61,13 +48,17 @@ def sweep(
     progress: bool = False,
     tolerance: float | None = None,
     max_cost: float = 60.0,
+    folder: str | Path | None = None,
+    force: bool = False,
+    timeout: float | None = None,
+    record: Literal["product", "distributions", "cells"] = "product",
 ) -> "xr.Dataset":
     """Run `scene` at every combination of `axes`, and return the summaries as one Dataset.
 
     Parameters
     ----------
     scene : Scene
-        Base scene; only its product is recorded.
+        Base scene; what is recorded of it is `record`.
     axes : mapping
         Scene fields by dotted name, each with its values: SI numbers or text with a unit, as in
         ``{"rolls.gap": ["40 mm", "60 mm"], "feed.top_size": [0.04, 0.06]}``.
@@ -80,24 +71,38 @@ def sweep(
     threads : int
         Threads if no client is given.
     progress : bool
-        Whether to show progress on standard error.
+        Whether to show on standard error what is read back, the predicted cost, and progress.
     tolerance : float, optional
         Wanted relative error, as in `hpgr.simulate`: every operating point gets a resolution of its own, and
         its estimated errors. Where streamlines differ, variables along them are left out.
     max_cost : float
         Predicted seconds that meeting the tolerance may take at an operating point.
+    folder : path, optional
+        Where finished cases are kept, for this sweep and later ones; default: nowhere. Cases that it holds already are
+        read back. Sweeps may share a folder, also at the same time: none computes what another is computing.
+    force : bool
+        Whether to compute cases that the folder holds already.
+    timeout : float, optional
+        Seconds that a case may take. Cases then run in processes of their own, so that one that hangs or dies loses
+        only itself; starting them takes about 2 s.
+    record : {"product", "distributions", "cells"}
+        What is kept of every case; other than the product, each case is a file in the folder, and
+        `studies.open_cases` opens them together. The result holds the summaries either way.
 
     Returns
     -------
     xarray.Dataset
         Dims: the axes (gap, roll_speed, feed_top_size, or the field's name), replicate, streamline, sieve.
         Every summary variable of `hpgr.simulate`; `status` and `message` of every case. A case that was
-        refused or failed holds NaN. Bits do not depend on threads, workers or order.
+        refused or failed holds NaN. Bits do not depend on threads, workers or order, nor on what was read back.
 
     Raises
     ------
     ValueError
-        If an axis is no scene field, has no or doubled values, or a value that its field refuses.
+        If an axis is no scene field, has no or doubled values, or a value that its field refuses; if cases are to be
+        recorded whole and no folder is given.
+    OSError
+        If finished cases cannot be kept, or the scheduler is lost; what was kept before is as it was.
 
     Examples
     --------
@@ -109,15 +114,24 @@ def sweep(
     {'gap': 2, 'replicate': 2}
     """
     grid = axis_values(axes)
+    if "rolls.gap" in grid and (scene.rolls.specific_pressing_force or "rolls.specific_pressing_force" in grid):
+        raise ValueError(
+            "rolls.gap: got it beside rolls.specific_pressing_force, under which the gap floats; give one of them"
+        )
     refuse_key("seed", seed)
     for name, value in {"replicates": replicates, "threads": threads}.items():
         if value < 1:
             raise ValueError(f"{name}: got {value}; must be at least 1; such as {name}=2")
-    base = scene.with_values({"resolution.record": "product"})
-    cases = list(enumerate_cases(grid, replicates))
-    outcomes = _outcomes((base, seed, tolerance, max_cost), cases, client, threads, progress)
-    result = _assemble(base, grid, replicates, seed, outcomes)
-    return result if tolerance is None else result.assign_attrs(tolerance=tolerance)
+    if timeout is not None and not 0.1 <= timeout <= 1e6:
+        raise ValueError(f"timeout: got {timeout:g}; must be 0.1 to 1,000,000 s; such as timeout=60")
+    if record != "product" and folder is None:
+        raise ValueError(f"folder: got None; record={record!r} needs a folder, which takes a file of each case")
+    base = scene.with_values({"resolution.record": record})
+    job = Job(base, seed, tolerance, max_cost, timeout, code_version())
+    with ExitStack() as stack:
+        kept = None if folder is None else stack.enter_context(CaseFolder(folder, afresh=force))
+        plan = _Plan(job, grid, replicates, kept)
+        return _assemble(job, grid, replicates, _outcomes(plan, client, threads, progress), plan)
 
 
 def axis_values(axes: Mapping[str, Iterable]) -> dict[str, list]:
@@ -159,175 +173,207 @@ def enumerate_cases(grid: Mapping[str, list], replicates: int) -> Iterator[Case]
         yield Case(index, values, index[-1])
 
 
+def finished_cases(
+    scene: Scene, axes: Mapping[str, Iterable], replicates: int, folder: str | Path, seed: int = 0,
+    tolerance: float | None = None, max_cost: float = 60.0,
+) -> dict[tuple[int, ...], int]:  # fmt: skip
+    """Return how many replicates of each operating point, by its index, `folder` holds intact; nothing is written."""
+    grid = axis_values(axes)
+    addresses = Addresses(Job(scene, seed, tolerance, max_cost, code=code_version()))
+    cases = {addresses.of(case.values, case.replicate): case.index[:-1] for case in enumerate_cases(grid, replicates)}
+    found = {record.address for record in read_folder(Path(folder), cases.__contains__)}
+    counted = Counter(cases[address] for address in found)
+    return {index: counted[index] for index in cases.values()}
+
+
 def dim_of(name: str) -> str:
     """Return the name of the dimension that a scene field has in a sweep."""
     section, _, key = name.partition(".")
     return _DIMS.get(name) or (key if section in {"material", "resolution"} else f"{section}_{key}")
 
 
-class Bench:
-    """Runs the cases of a batch one after the other, and keeps what the next may share: scene and loaded bed."""
+class _Plan:
+    """What is left to do of a sweep, and where finished cases go."""
 
-    def __init__(self, base: Scene, seed: int, tolerance: float | None, max_cost: float):
-        self._base, self._seed, self._tolerance, self._max_cost = base, seed, tolerance, max_cost
-        self._values: dict[str, Any] | None = None
-        self._scene, self._key, self._prepared = base, None, None
-        self._chosen: dict[str, float] = {}
-        self._room = budget.available_memory()
+    def __init__(self, job: Job, grid: Mapping[str, list], replicates: int, kept: CaseFolder | None):
+        self.job, self.kept = job, kept
+        self._grid, self._replicates = grid, replicates
+        self.shape = (*(len(values) for values in grid.values()), replicates)
+        self.total = int(np.prod(self.shape))
+        addresses = Addresses(job)
+        self.addresses = [addresses.of(case.values, case.replicate) for case in enumerate_cases(grid, replicates)]
+        self._numbers = {address: number for number, address in enumerate(self.addresses)}  # of those not yet here
+        self._queue = deque(range(self.total))
+        self._elsewhere: deque[int] = deque()  # what other drivers are computing
+        self._fresh: list[Outcome] = []  # read back, and not yet told
+        self.batch = 1
 
-    def simulate(self, case: Case) -> dict[str, Any]:
-        """Return the variables of a case by name, as `hpgr.simulate` would."""
-        if case.values != self._values:
-            self._scene, self._values = machine.at_operating_gap(self._base.with_values(case.values)), None
-            if self._tolerance is not None:
-                estimate = tolerances.refine(self._scene, self._tolerance, self._max_cost, self._seed)
-                self._scene, self._chosen = machine.at_operating_gap(estimate.scene), estimate.variables()
-            budget.refuse_too_large(self._scene, self._room)
-            self._values = case.values  # now only: a refused scene must not be taken for the next replicate's
-        key = pipeline.bed_key(self._scene)
-        if key != self._key:
-            self._prepared, self._key = pipeline.prepare(self._scene), key
-        return pipeline.crush(self._scene, self._prepared, self._seed, case.replicate) | self._chosen
+    @property
+    def left(self) -> int:
+        """Number of cases without an outcome."""
+        return len(self._numbers)
 
+    def is_open(self) -> bool:
+        """Return whether there are cases that neither this driver nor the folder has yet."""
+        return bool(self._queue or self._elsewhere)
 
-def run_case(bench: Bench, case: Case) -> Outcome:
-    """Simulate one case; whatever happens is told in the outcome, never raised."""
-    try:
-        values = bench.simulate(case)
-        summary = summarise(values)
-    except ValidationError as error:
-        return Outcome(case.index, "refused", faults_of(error), {})
-    except (ValueError, MemoryError) as error:
-        return Outcome(case.index, "refused", str(error), {})
-    except Exception as error:  # a fault in one case must not lose the others
-        return Outcome(case.index, "failed", f"{type(error).__name__}: {error}", {})
-    broken = [name for name, (_, value) in summary.items() if not np.isfinite(value).all()]
-    if broken:
-        return Outcome(case.index, "failed", f"not finite: {', '.join(broken)}", {})
-    return Outcome(case.index, "ok", "", summary, values["notes"])
-
-
-def summarise(values: Mapping[str, Any]) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
-    """Return the variables of a simulation that have neither points nor cells, with their dims."""
-    return {
-        name: (entry.dims, np.asarray(values[name], entry.dtype))
-        for name, entry in (schema.COORDINATES | schema.VARIABLES).items()
-        if values.get(name) is not None and not {"point", "cell", "time"} & set(entry.dims)
-    }
-
-
-def _run_batch(bench_of: tuple, cases: list[Case]) -> list[Outcome]:
-    bench = Bench(*bench_of)
-    return [run_case(bench, case) for case in cases]
-
-
-def _outcomes(bench_of, cases, client, threads, progress) -> Iterator[Outcome]:
-    """Yield the outcome of every case as it comes in, in no particular order."""
-    from distributed import Client, LocalCluster, as_completed  # late: importing costs 0.5 s
-
-    if client is None:
-        # one process: the kernels release the lock; its dashboards would listen on every interface
-        with (
-            LocalCluster(
-                processes=False,
-                n_workers=1,
-                threads_per_worker=threads,
-                dashboard_address="127.0.0.1:0",
-                worker_dashboard_address="127.0.0.1:0",
-                memory_limit=0,
-            ) as cluster,
-            Client(cluster) as own,
-            _short_turns(),
-        ):
-            yield from _outcomes(bench_of, cases, own, threads, progress)
-        return
-    workers = max(1, sum(client.nthreads().values()))
-    quick = int(_BATCH_SECONDS / budget.predict(bench_of[0]).seconds)
-    size = max(1, min(_BATCH, quick, len(cases) // (4 * workers)))
-    if bench_of[2] is not None:  # a tolerance: the replicates of an operating point share its refinement
-        size = 1 + max(case.replicate for case in cases)
-    batches = [cases[start : start + size] for start in range(0, len(cases), size)]
-    futures = client.map(_run_batch, [bench_of] * len(batches), batches, pure=False)
-    sent = dict(zip(futures, batches, strict=True))
-    with _bar(len(cases), progress) as bar:
-        for future in as_completed(futures, raise_errors=False):
-            batch = sent.pop(future)
-            if future.status == "finished":
-                yield from future.result()
+    def next_batch(self) -> list[Case]:
+        """Return cases to compute, now this driver's; none if there are none to be had now."""
+        if not self._queue:
+            self._queue, self._elsewhere = self._elsewhere, deque()
+        batch: list[int] = []
+        while self._queue and len(batch) < self.batch:
+            number = self._queue[0]
+            if batch and self.job.tolerance is not None and number // self._replicates != batch[0] // self._replicates:
+                break  # the replicates of an operating point share its refinement
+            self._queue.popleft()
+            address = self.addresses[number]
+            if address not in self._numbers:  # read back
+                continue
+            if self.kept is None or self.kept.claim(address):
+                batch.append(number)
             else:
-                reason = f"{type(future.exception()).__name__}: {future.exception()}"
-                yield from (Outcome(case.index, "failed", reason, {}) for case in batch)
-            future.release()
-            bar.update(len(batch))
+                self._elsewhere.append(number)
+        self._fresh += self._read()  # what another driver finished before this one claimed it
+        return [self.case(number) for number in batch if self.addresses[number] in self._numbers]
+
+    def case(self, number: int) -> Case:
+        """Return a case by its number in the order of the axes, replicates fastest."""
+        index = tuple(map(int, np.unravel_index(number, self.shape)))
+        values = {name: self._grid[name][k] for name, k in zip(self._grid, index[:-1], strict=True)}
+        return Case(index, values, index[-1])
+
+    def read_back(self) -> Iterator[Outcome]:
+        """Yield the outcomes that have come into the folder since the last call."""
+        fresh, self._fresh = self._fresh, []
+        yield from fresh
+        yield from self._read()
+
+    def _read(self) -> Iterator[Outcome]:
+        if self.kept is None:
+            return
+        for found in self.kept.read(self._numbers.__contains__):
+            index = np.unravel_index(self._numbers.pop(found.address), self.shape)
+            self.kept.release(found.address)
+            yield outcome_of(found.header, found.arrays, tuple(map(int, index)))
+
+    def settle(self, outcome: Outcome) -> Outcome:
+        """Keep a computed outcome if it is well; return it without what has gone to a file."""
+        address = self.addresses[int(np.ravel_multi_index(outcome.index, self.shape))]
+        self._numbers.pop(address, None)
+        if self.kept is None:
+            return outcome
+        if outcome.status != "ok":  # never counts as done
+            self.kept.release(address)
+            return outcome
+        write = (lambda path: recorded.write_case(outcome, address, path)) if outcome.whole is not None else None
+        self.kept.put(address, outcome, write)
+        return outcome._replace(whole=None, attrs=None)
 
 
-@contextmanager
-def _short_turns() -> Iterator[None]:
-    """Let threads take turns at the interpreter every 0.2 ms instead of 5 ms, as long as a case's own Python.
+def _outcomes(plan: _Plan, client: Any, threads: int, progress: bool) -> Iterator[Outcome]:
+    """Yield the outcome of every case: first those read back, then the others as they come in."""
+    yield from plan.read_back()
+    if progress and plan.kept is not None:
+        say(f"{plan.total - plan.left} of {plan.total} cases read back from {plan.kept.folder}")
+    if not plan.left:
+        return
+    if client is None:
+        with runner.own_client(threads) as own:
+            yield from _computed(plan, own, progress)
+    else:
+        yield from _computed(plan, client, progress)
 
-    A thread that comes back from its kernel then waits less: 2 threads gain 1.6 instead of 1.4 times one.
-    """
-    usual = sys.getswitchinterval()
-    sys.setswitchinterval(2e-4)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(usual)
+
+def _computed(plan: _Plan, client: Any, progress: bool) -> Iterator[Outcome]:
+    workers = runner.workers_of(client)
+    plan.batch = _batch_size(plan, workers)
+    if progress:
+        say(_prediction(plan, workers))
+    with _bar(plan.total, plan.total - plan.left, progress) as bar:
+        for outcome in runner.outcomes(plan.job, plan, client):
+            yield plan.settle(outcome)
+            bar.update(plan.total - plan.left - bar.n)
 
 
-def _bar(total: int, progress: bool):
+def _batch_size(plan: _Plan, workers: int) -> int:
+    if plan.job.whole:  # a case at a time, or the driver's memory would grow with the batch
+        return 1
+    if plan.job.tolerance is not None:
+        return plan.shape[-1]
+    quick = int(_BATCH_SECONDS / budget.predict(plan.job.base).seconds)
+    return max(1, min(_BATCH, quick, plan.left // (4 * workers)))
+
+
+def _prediction(plan: _Plan, workers: int) -> str:
+    """Return in words what the cases that are left are predicted to cost."""
+    points, replicates = plan.total // plan.shape[-1], plan.shape[-1]
+    costs = []
+    for point in np.unique(np.linspace(0, points - 1, min(points, _PREDICTED)).astype(int)):
+        try:
+            costs.append(budget.predict(plan.job.base.with_values(plan.case(int(point) * replicates).values)))
+        except ValidationError:
+            continue  # refused, which costs nothing
+    seconds = plan.left * sum(cost.seconds for cost in costs) / max(len(costs), 1) / workers
+    most = max((cost.bytes for cost in costs), default=0)
+    before = ", before refinement" if plan.job.tolerance is not None else ""
+    return (
+        f"{plan.left} cases to compute on {workers} thread{'s' * (workers > 1)}: predicted {seconds:.2g} s, "
+        f"at most {most / 1e6:.3g} MB a case{before}"
+    )
+
+
+def _bar(total: int, done: int, progress: bool):
     """Return a progress bar; where no terminal is watching, a plain line every few seconds."""
     from tqdm import tqdm
 
     if sys.stderr.isatty():
-        return tqdm(total=total, unit=" cases", disable=not progress)
+        return tqdm(total=total, initial=done, unit=" cases", disable=not progress)
     line = "{n_fmt} of {total_fmt} cases, {rate_fmt}, {remaining} left\n"
-    return tqdm(total=total, unit=" cases", disable=not progress, bar_format=line, mininterval=5)
+    return tqdm(total=total, initial=done, unit=" cases", disable=not progress, bar_format=line, mininterval=5)
 
 
-def _assemble(base, grid, replicates, seed, outcomes) -> "xr.Dataset":
-    """Return one Dataset of all outcomes over the axes and replicates."""
+def _assemble(job: Job, grid, replicates: int, outcomes: Iterable[Outcome], plan: _Plan) -> "xr.Dataset":
+    """Return one Dataset of all outcomes over the axes and replicates, the same whatever their order."""
     import xarray as xr
 
     dims = (*(dim_of(name) for name in grid), "replicate")
-    shape = (*(len(values) for values in grid.values()), replicates)
+    shape = plan.shape
     status = np.full(shape, STATUS["failed"], np.int8)
     messages, notes = np.full(shape, "", object), np.full(shape, "", object)
-    stacks: dict[str, tuple[tuple[str, ...], np.ndarray]] = {}
+    stacks: dict[str, np.ndarray] = {}
+    along: dict[str, np.ndarray] = {}  # coordinates, the same for every case that has them
     uneven: set[str] = set()
     for outcome in outcomes:
         status[outcome.index] = STATUS[outcome.status]
         messages[outcome.index], notes[outcome.index] = outcome.message, outcome.notes
-        for name, (own_dims, value) in outcome.summary.items():
-            stack = stacks.get(name)
-            if stack is None:
-                stack = stacks[name] = (own_dims, _blank((*shape, *value.shape), value.dtype))
-            if stack[1].shape[len(shape) :] == value.shape:
-                stack[1][outcome.index] = value
-            else:  # an axis over the number of streamlines or sieves makes it ragged
+        for name, (_, value) in outcome.summary.items():
+            if name in schema.COORDINATES:
+                known = along.setdefault(name, value)
+            else:
+                if name not in stacks:
+                    stacks[name] = _blank((*shape, *value.shape), value.dtype)
+                stacks[name][outcome.index] = value if value.shape == stacks[name].shape[len(shape) :] else 0
+                known = stacks[name][outcome.index]
+            if known.shape != value.shape:  # an axis over the number of streamlines or sieves makes it ragged
                 uneven.add(name)
-    dataset = xr.Dataset(attrs=_attributes(base, grid, replicates, seed, uneven))
+    dataset = xr.Dataset(attrs=_attributes(job, grid, replicates, uneven))
     for name, values in grid.items():
         info = field_info(name)
         attrs = {"units": info.unit, "long_name": info.text, "scene_field": name}
         dataset.coords[dim_of(name)] = (dim_of(name), np.array(values), attrs if info.unit else {})
-    attrs = {"units": "1", "long_name": "independent repetition", "standard_name": "realization"}
+    attrs = {"standard_name": "realization", "units": "1", "long_name": "independent repetition"}
     dataset.coords["replicate"] = ("replicate", np.arange(replicates, dtype=np.int32), attrs)
-    for name, (own_dims, stack) in stacks.items():
-        if name in uneven:
-            continue
-        if name in schema.COORDINATES:  # the same for every case that has one
-            first = stack.reshape(-1, *stack.shape[len(shape) :])
-            first = first[np.isfinite(first).all(axis=1)][0]
-            dataset.coords[name] = (own_dims, first, schema.attributes(name))
-        else:
-            dataset[name] = ((*dims, *own_dims), stack, schema.attributes(name))
-    dataset["status"] = (dims, status, {
-        "units": "1", "long_name": "what became of the case",
-        "flag_values": np.array(list(STATUS.values()), np.int8), "flag_meanings": " ".join(STATUS),
-    })  # fmt: skip
+    for name in (name for name in schema.COORDINATES if name in along and name not in uneven):
+        dataset.coords[name] = (schema.COORDINATES[name].dims, along[name], schema.attributes(name))
+    for name in (name for name in schema.VARIABLES if name in stacks and name not in uneven):
+        dataset[name] = ((*dims, *schema.VARIABLES[name].dims), stacks[name], schema.attributes(name))
+    dataset["status"] = (dims, status, recorded.status_attributes())
     dataset["message"] = (dims, messages, {"long_name": "why a case holds no result"})
     dataset["notes"] = (dims, notes, {"long_name": "which limits a case hit, in words"})
+    if job.whole:
+        manifest = {name: value for name, value in dataset.attrs.items() if name != "left_out"}
+        recorded.write_manifest(plan.kept.folder, dims[:-1], grid, replicates, plan.addresses, status, manifest)
     return dataset
 
 
@@ -336,16 +382,17 @@ def _blank(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
     return np.full(shape, np.nan if dtype.kind == "f" else 0, dtype)
 
 
-def _attributes(base, grid, replicates, seed, uneven) -> dict[str, Any]:
-    return {
+def _attributes(job: Job, grid, replicates: int, uneven: set[str]) -> dict[str, Any]:
+    found = {
         "Conventions": "CF-1.11",
         "title": "Parametric study of comminution in high pressure grinding rolls",
         "source": f"hpgr {hpgr.__version__}",
-        "scene": base.model_dump_json(),
+        "scene": job.base.model_dump_json(),
         "axes": ", ".join(grid),
-        "seed": seed,
+        "seed": job.seed,
         "replicates": replicates,
         "left_out": ", ".join(sorted(uneven)),
-        "level": level_text(base.resolution.level),
-        "versions": ", ".join(f"{name} {version(name)}" for name in _LIBRARIES),
+        "level": level_text(job.base.resolution.level),
+        "versions": ", ".join(f"{name} {version(name)}" for name in LIBRARIES),
     }
+    return found if job.tolerance is None else found | {"tolerance": job.tolerance}

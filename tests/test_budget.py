@@ -1,5 +1,10 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
-from support import paper
+from support import paper, sized
 
 from hpgr import budget, simulate
 
@@ -70,15 +75,89 @@ def test_largest_scene_is_refused():
             budget.refuse_too_large(paper(values))
 
 
-def test_the_tightest_limit_counts(monkeypatch, tmp_path):
-    limit, used = tmp_path / "max", tmp_path / "current"
-    limit.write_text("1000\n")
-    used.write_text("400\n")
-    monkeypatch.setattr(budget, "_CGROUP_FILES", ((limit, used),))
-    assert budget.available_memory() == (600, "the cgroup's memory limit")
-    limit.write_text("max\n")
+@pytest.fixture
+def groups(monkeypatch, tmp_path):
+    """Control groups of version 2 that are files of the test; return what writes one."""
+    monkeypatch.setattr(budget, "_PROCESS", tmp_path / "own")
+    monkeypatch.setattr(budget, "_CGROUPS", ((tmp_path, "memory.max", "memory.current", "inactive_file"),))
+    (tmp_path / "own").write_text("0::/job/step\n")
+
+    def write(name, limit, used, cached=None):
+        group = tmp_path / name
+        group.mkdir(parents=True, exist_ok=True)
+        (group / "memory.max").write_text(f"{limit}\n")
+        (group / "memory.current").write_text(f"{used}\n")
+        if cached is not None:
+            (group / "memory.stat").write_text(f"anon 5\ninactive_file {cached}\n")
+
+    return write
+
+
+def test_the_tightest_of_own_and_enclosing_groups_counts(groups):
+    groups("", "max", 10)
     available, name = budget.available_memory()
     assert name == "physical memory"
     assert available > 600
-    monkeypatch.setattr(budget, "_CGROUP_FILES", ((tmp_path / "none", used),))
+    groups("job/step", 5000, 400)
+    assert budget.available_memory() == (4600, "the memory limit of cgroup /job/step")
+    groups("job", 1000, 500)
+    assert budget.available_memory() == (500, "the memory limit of cgroup /job")
+    groups("", 900, 500)
+    assert budget.available_memory() == (400, "the memory limit of cgroup /")
+    groups("other", 1, 0)  # not this process's
+    assert budget.available_memory()[0] == 400
+
+
+def test_cache_of_files_counts_as_free(groups):
+    groups("job/step", 1000, 900, cached=700)
+    assert budget.available_memory()[0] == 800
+    groups("job/step", 1000, 1900, cached=0)
+    assert budget.available_memory()[0] == 0
+
+
+def test_groups_of_version_1_are_found(monkeypatch, tmp_path):
+    monkeypatch.setattr(budget, "_PROCESS", tmp_path / "own")
+    monkeypatch.setattr(budget, "_CGROUPS", ((tmp_path, "limit", "used", "cache"),))
+    (tmp_path / "own").write_text("5:cpu:/elsewhere\n4:memory:/slurm/job_7\n0::/\n")
+    for name, limit in {"slurm/job_7": 4000, "elsewhere": 10}.items():
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "limit").write_text(str(limit))
+        (tmp_path / name / "used").write_text("1000")
+    assert budget.available_memory() == (3000, "the memory limit of cgroup /slurm/job_7")
+
+
+@pytest.mark.parametrize("own", ["0::/../..\n", None])
+def test_groups_that_cannot_be_seen_do_not_count(monkeypatch, tmp_path, own):
+    monkeypatch.setattr(budget, "_PROCESS", tmp_path / "own")
+    monkeypatch.setattr(budget, "_CGROUPS", ((tmp_path / "none", "memory.max", "memory.current", "inactive_file"),))
+    if own is not None:
+        (tmp_path / "own").write_text(own)
     assert budget.available_memory()[1] == "physical memory"
+
+
+def test_refusal_names_the_group_that_it_was_held_against(groups):
+    needed = budget.predict(paper()).bytes
+    groups("job/step", needed + 100, 100)
+    with pytest.raises(MemoryError, match=f"80% of the {needed:,} bytes that the memory limit of cgroup /job/step"):
+        budget.refuse_too_large(paper())
+
+
+def test_prediction_covers_what_a_process_takes():
+    """Peak memory of a process that runs a scene, above that of one that runs the same scene with few cells."""
+    script = (
+        "import resource, sys; from support import paper; from hpgr import budget, simulate\n"
+        "scene = paper({'resolution.cells': int(sys.argv[1]), 'resolution.points': 101})\n"
+        "simulate(scene)\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, budget.predict(scene).bytes)\n"
+    )
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+
+    def peak(cells):
+        done = subprocess.run(
+            [sys.executable, "-W", "ignore", "-c", script, str(cells)], capture_output=True, text=True, check=True,
+            env=os.environ | {"PYTHONPATH": path},
+        )  # fmt: skip
+        return map(int, done.stdout.split())
+
+    (few, _), (many, predicted) = peak(10), peak(sized(60_000, 2000))
+    assert many - few < 1.2 * predicted + 20e6  # an interpreter's own memory varies by some MB

@@ -53,7 +53,9 @@ def refused(run, folder, monkeypatch):
 
 
 def files(folder):
-    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+    """Names of all files but finished cases, which are beside the result in a folder of their own."""
+    paths = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+    return sorted(str(path) for path in paths if path.parent.suffix != ".cases")
 
 
 def opened(path):
@@ -70,6 +72,9 @@ def test_defaults(run, folder, name):
     code, out, err = run(study=STUDIES[name])
     assert code == 0, err
     assert files(folder) == [f"outputs/{name}.nc", f"outputs/{name}.png"]
+    assert sorted(path.name for path in (folder / "outputs").iterdir()) == [
+        f"{name}{end}" for end in (".cases", ".nc", ".png")
+    ]
     assert (folder / "outputs" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     assert f"wrote outputs/{name}.nc and outputs/{name}.png" in out
     assert STUDIES[name].STUDY.caption in out
@@ -164,6 +169,7 @@ def test_out(run, folder, given, made):
     assert code == 0
     assert f"{made}.nc" in files(folder)
     assert f"{made}.png" in files(folder)
+    assert (folder / f"{made}.cases" / "lock").is_file()
     assert len(files(folder)) == 2
 
 
@@ -211,6 +217,54 @@ def test_dry_run_lists_cases_and_writes_nothing(run, folder, monkeypatch):
     assert all(re.search(r"40 mm\s+1[59] rpm\s+[\d.]+ MB\s+[\d.]+ ms$", row) for row in rows[:2])
     assert all("refused: rolls.gap: got 1200 mm" in row for row in rows[2:])
     assert "12 cases (3 replicates each)" in out
+
+
+def test_second_run_reads_every_case_back(run, folder, monkeypatch):
+    code, out, err = run("--gap", "40 mm", "1.2 m", "60 mm", "--no-plot")
+    assert code == 1
+    assert "0 of 9 cases read back from outputs/gap_sweep.cases" in err
+    assert re.search(r"9 cases to compute on 2 threads: predicted [\d.e-]+ s, at most [\d.]+ MB a case", err)
+    first = opened("outputs/gap_sweep.nc")
+    monkeypatch.setattr(pipeline, "crush", None)  # calling it would fail the case
+    again, out_again, err_again = run("--gap", "40 mm", "1.2 m", "60 mm", "--no-plot")
+    assert "6 of 9 cases read back from outputs/gap_sweep.cases" in err_again  # refused cases are not kept
+    assert (again, out_again) == (code, out)
+    xr.testing.assert_identical(opened("outputs/gap_sweep.nc"), first)
+    code, _, err = run("--gap", "40 mm", "--no-plot", "--force")
+    assert code == 1
+    assert "failed: gap 40 mm, 3 of 3 replicates" in err  # nothing was read back
+
+
+def test_dry_run_says_what_is_finished(run, folder):
+    assert run("--gap", "40 mm", "60 mm", "--replicates", "2", "--no-plot")[0] == 0
+    before = sorted(folder.rglob("*"))
+    code, out, err = run("--gap", "40 mm", "50 mm", "60 mm", "--dry-run")
+    assert (code, err) == (0, "")
+    rows = [line.split()[-3:] for line in out.splitlines() if re.match(r"\s+[456]0 mm", line)]
+    assert rows == [["2", "of", "3"], ["0", "of", "3"], ["2", "of", "3"]]
+    assert "9 cases (3 replicates each), 4 of them finished already in outputs/gap_sweep.cases" in out
+    assert sorted(folder.rglob("*")) == before
+    assert "finished" not in run("--gap", "40 mm", "--dry-run", "--force")[1]
+
+
+def test_interrupt_says_how_to_go_on(run, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("studies.sweep.sweep", interrupted)
+    code, _, err = run("--gap", "40 mm")
+    assert code == 130
+    assert "finished cases are kept" in err
+
+
+def test_cases_recorded_whole(run, folder):
+    import studies
+
+    assert run("--gap", "40 mm", "60 mm", "--replicates", "2", "--no-plot", "--record", "distributions")[0] == 0
+    cases = studies.open_cases("outputs/gap_sweep.cases")
+    assert dict(cases["mass_fraction"].sizes)["gap"] == 2
+    total = cases["mass_fraction"].sum("sieve").compute()
+    assert np.allclose(total, 1, atol=1e-6)
 
 
 def test_dry_run_predicts_more_for_more_cells(run):
@@ -317,6 +371,8 @@ def test_feed_of_one_size_has_no_top_size(run, folder):
         (["--scene", "gone.json"], ["gone.json"]),
         (["--workers", "0"], ["--workers", "0", "at least 1"]),
         (["--replicates", "0"], ["--replicates", "0", "at least 1"]),
+        (["--timeout", "0"], ["--timeout", "0", "0.1", "1,000,000"]),
+        (["--timeout", "nan"], ["--timeout", "nan"]),
         (["--seed", "-1"], ["--seed", "-1", "from 0"]),
         (["--sieve", "3 m"], ["--sieve", "'3 m'", "1000 mm"]),
         (["--sieve", "1 nm"], ["--sieve", "'1 nm'", "0.001 mm"]),
@@ -412,7 +468,8 @@ def test_help_explains_every_option(name):
     assert done.returncode == 0
     for option in [
         "--gap", "--roll-speed", "--feed-top-size", "--scene", "--replicates", "--cells", "--points", "--streamlines",
-        "--sieve", "--workers", "--scheduler", "--seed", "--out", "--no-plot", "--dry-run",
+        "--sieve", "--workers", "--scheduler", "--seed", "--out", "--no-plot", "--dry-run", "--force", "--timeout",
+        "--record",
     ]:  # fmt: skip
         assert re.search(rf"{option}\b", done.stdout), option
     assert f"python -m studies.{name}" in done.stdout

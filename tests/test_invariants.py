@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import paper, sized
 
@@ -28,6 +28,7 @@ KNOWN = {
 }
 
 
+@settings(max_examples=sized(40, 10))
 @given(
     st.dictionaries(st.sampled_from(sorted(KNOWN)), st.floats(0, 1), max_size=8),
     st.sampled_from(sorted(extremes.FEEDS)),
@@ -214,6 +215,7 @@ def assert_scaled(first, second, length=1.0, pressure=1.0, rate=1.0):
         assert np.array_equal(variable.values * factor, second[name].values), name
 
 
+@settings(max_examples=sized(20, 6))
 @given(any_scene, st.sampled_from([4.0, 0.25]), st.integers(0, 3))
 def test_all_lengths_times_4_give_all_sizes_times_4(values, factor, seed):
     scene = built(values)
@@ -223,6 +225,7 @@ def test_all_lengths_times_4_give_all_sizes_times_4(values, factor, seed):
     assert_scaled(simulate(scene, seed), simulate(scene.with_values(larger), seed), length=factor)
 
 
+@settings(max_examples=sized(20, 6))
 @given(any_scene, st.sampled_from([8.0, 0.5]), st.integers(0, 3))
 def test_moduli_and_strength_times_8_give_pressures_times_8_and_the_same_sizes(values, factor, seed):
     scene = built(values)
@@ -230,6 +233,7 @@ def test_moduli_and_strength_times_8_give_pressures_times_8_and_the_same_sizes(v
     assert_scaled(simulate(scene, seed), simulate(scene.with_values(stronger), seed), pressure=factor)
 
 
+@settings(max_examples=sized(20, 6))
 @given(any_scene, st.sampled_from([2.0, 1024.0]), st.integers(0, 3))
 def test_speed_times_2_changes_rates_times_and_throughput_only(values, factor, seed):
     scene = built(values)

@@ -298,10 +298,10 @@ def test_negative_exponents_that_ask_for_tension_are_told():
 @pytest.mark.parametrize("integrator", ["increment", "euler"])
 def test_negative_exponents_are_told_by_both_integrators(integrator, c):
     """At the onset shear outweighs compaction, and the law asks for tension; the explicit rule steps over it."""
-    scene = paper({"material.elastic_exponent": c, "stress.integrator": integrator})
-    strained = motion(np.full(11, 0.01), np.full(11, 1.0), 0.1)
-    assert stress.load(scene, strained).tension_clamped
-    assert not stress.load(paper({"stress.integrator": integrator}), strained).tension_clamped
+    for exponent, told in ((c, True), (0.5, False)):
+        scene = paper({"material.elastic_exponent": exponent, "stress.integrator": integrator})
+        strained = flow.move(scene, geometry.bed(scene.rolls, 3), 201)
+        assert stress.load(scene, strained).tension_clamped == told
 
 
 def test_shear_stress_held_at_zero_is_told_where_pressure_is_not():

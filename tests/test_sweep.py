@@ -12,6 +12,7 @@ from support import paper
 
 import hpgr
 from hpgr import pipeline, schema
+from studies import runner
 from studies import sweep as module
 from studies.gap_sweep import main
 from studies.sweep import STATUS, sweep
@@ -303,14 +304,14 @@ def test_case_that_is_not_finite_loses_itself_only(base, client, good, monkeypat
 
 def test_lost_task_loses_its_batch_only(base, client, monkeypatch):
     good = sweep(base, {"rolls.gap": GAPS}, client=client)
-    real = module.run_case
+    real = runner.run_case
 
     def run_case(bench, case):
         if case.index == (1, 0):
             raise SystemError("worker lost")
         return real(bench, case)
 
-    monkeypatch.setattr(module, "run_case", run_case)
+    monkeypatch.setattr(runner, "run_case", run_case)
     result = sweep(base, {"rolls.gap": GAPS}, client=client)
     lost_only(result, good, (1, 0), "failed", "SystemError", "worker lost")
 

@@ -1,0 +1,179 @@
+"""Sweeps on real dask clusters on loopback: bits as in one process, also when a worker is killed on the way."""
+
+import contextlib
+import gc
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import psutil
+import pytest
+import xarray as xr
+from support import paper, sized
+
+from studies import runner
+from studies.bench import STATUS
+from studies.sweep import sweep
+
+SMALL = {"resolution.streamlines": 2, "resolution.points": 20, "resolution.cells": 16}
+AXES = {"rolls.gap": [0.04 + 0.001 * k for k in range(20)]}
+
+# slows every case down, so that a worker can be killed on the way; and one gap kills the process it runs in
+PATCH = """
+import os, time
+from hpgr import pipeline
+
+real = pipeline.crush
+
+def crush(scene, prepared, seed, replicate):
+    time.sleep(0.05)
+    if scene.rolls.gap == 0.0405: os._exit(7)
+    return real(scene, prepared, seed, replicate)
+
+pipeline.crush = crush
+"""
+
+
+@pytest.fixture(scope="module")
+def base():
+    return paper(SMALL)
+
+
+@contextlib.contextmanager
+def process(*arguments, cwd, env):
+    with open(cwd / "log", "ab") as log:
+        running = subprocess.Popen([sys.executable, "-m", *arguments], cwd=cwd, env=env, stdout=log, stderr=log)
+        try:
+            yield running
+        finally:
+            with contextlib.suppress(psutil.NoSuchProcess):
+                for child in psutil.Process(running.pid).children(recursive=True):
+                    with contextlib.suppress(psutil.NoSuchProcess):
+                        child.kill()
+            running.kill()
+            running.wait()
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    """Client of a scheduler and two workers (the second without a nanny), and the processes of the workers."""
+    from distributed import Client
+
+    cwd = tmp_path_factory.mktemp("cluster")
+    (cwd / "patch").mkdir()
+    (cwd / "patch" / "sitecustomize.py").write_text(PATCH)
+    path = os.pathsep.join([str(cwd / "patch"), *sys.path])
+    env = os.environ | {"PYTHONPATH": path, "PYTHONWARNINGS": "ignore"}
+    file = cwd / "scheduler.json"
+    common = ["--host", "127.0.0.1", "--no-dashboard"]
+    worker = [*common, "--nthreads", "1", "--local-directory", str(cwd), "--death-timeout", "60"]
+    plain = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    with contextlib.ExitStack() as stack:
+        scheduler = stack.enter_context(
+            process(
+                "distributed.cli.dask_scheduler", *common, "--port", "0", "--scheduler-file", str(file), cwd=cwd,
+                env=plain,
+            )
+        )  # fmt: skip
+        deadline = time.monotonic() + 120
+        address = None
+        while address is None:
+            assert time.monotonic() < deadline, (cwd / "log").read_text()
+            assert scheduler.poll() is None, (cwd / "log").read_text()
+            with contextlib.suppress(OSError, ValueError):  # not yet, or half written
+                address = json.loads(file.read_text())["address"]
+            time.sleep(0.05)
+        stack.enter_context(process("distributed.cli.dask_worker", address, *worker, cwd=cwd, env=env))
+        second = stack.enter_context(
+            process("distributed.cli.dask_worker", address, "--no-nanny", *worker, cwd=cwd, env=env)
+        )
+        client = stack.enter_context(Client(address))
+        client.wait_for_workers(2, timeout=120)
+        yield client, second
+
+
+def test_case_that_kills_its_worker_is_named(base, cluster):
+    """With a timeout cases run in processes of their own: the worker lives on, and only the guilty case is lost."""
+    client, _ = cluster
+    axes = {"rolls.gap": [0.04, 0.0405, 0.041]}
+    result = sweep(base, axes, replicates=2, client=client, timeout=30.0)
+    assert result["status"].values.tolist() == [[0, 0], [STATUS["worker_lost"]] * 2, [0, 0]]
+    assert "exit code 7" in result["message"].values[1, 0]
+    good = sweep(base, axes, replicates=2)
+    for name in set(good.data_vars) - {"status", "message", "notes"}:
+        assert np.array_equal(result[name].values[[0, 2]], good[name].values[[0, 2]]), name
+    assert len(client.nthreads()) == 2
+
+
+def test_worker_killed_on_the_way_changes_no_bit(base, cluster, tmp_path):
+    client, victim = cluster
+    calls = []
+
+    real = runner._settle
+
+    def settle(future, batch, again):
+        calls.append(len(batch))
+        if len(calls) == 3:
+            victim.send_signal(signal.SIGKILL)
+        return real(future, batch, again)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runner, "_settle", settle)
+        far = sweep(base, AXES, replicates=sized(4, 2), seed=5, client=client, folder=tmp_path)
+    assert victim.wait(10) == -signal.SIGKILL
+    assert len(client.nthreads()) == 1
+    near = sweep(base, AXES, replicates=sized(4, 2), seed=5)
+    xr.testing.assert_identical(far, near)
+    assert (far["status"] == 0).all()
+    again = sweep(base, AXES, replicates=sized(4, 2), seed=5, folder=tmp_path)  # read back without the cluster
+    xr.testing.assert_identical(again, near)
+
+
+def test_lost_scheduler_is_told_and_finished_cases_are_kept(base, tmp_path):
+    with runner.own_client(1) as client:
+        real, submit = runner._settle, client.submit
+        calls, sent = [], []
+
+        def settle(future, batch, again):
+            calls.append(batch)
+            if len(calls) == 3:
+                client.cancel(sent)  # what a client does when its scheduler has gone
+            return real(future, batch, again)
+
+        def submit_seen(*arguments, **options):
+            sent.append(submit(*arguments, **options))
+            return sent[-1]
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(runner, "_settle", settle)
+            patch.setattr(client, "submit", submit_seen)
+            with pytest.raises(ConnectionError, match=r"lost the dask scheduler.*run the same command again"):
+                sweep(base, AXES, client=client, folder=tmp_path)
+    assert list(tmp_path.glob("*.seg"))
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+def test_dask_jobqueue(base, tmp_path, monkeypatch):
+    """The path of docs/scaling.md to SLURM, with jobs that are processes of this machine."""
+    jobqueue = pytest.importorskip("dask_jobqueue.local", reason="dask-jobqueue is not installed (extra hpc)")
+    from distributed import Client
+
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    monkeypatch.setenv("PYTHONWARNINGS", "ignore")
+    with (
+        jobqueue.LocalCluster(
+            cores=1, processes=1, memory="2GB", python=sys.executable, interface=None, local_directory=str(tmp_path),
+            scheduler_options={"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"},
+            worker_extra_args=["--host", "127.0.0.1"],
+        ) as cluster,
+        Client(cluster) as client,
+    ):  # fmt: skip
+        cluster.scale(jobs=2)
+        client.wait_for_workers(1, timeout=120)
+        far = sweep(base, {"rolls.gap": [0.04, 0.05]}, replicates=2, client=client)
+    xr.testing.assert_identical(far, sweep(base, {"rolls.gap": [0.04, 0.05]}, replicates=2))
+    gc.collect()  # dask-jobqueue leaves processes and pipes to the collector, which warns of them
