@@ -17,7 +17,12 @@ PAGE = Path(__file__).parent / "api.md"
 
 # Modules whose public names are all listed, and single functions of others that a user calls.
 MODULES = ("metrics", "machine", "calibration", "tables", "feed", "limits", "baselines")
-STUDIES = (("studies.sweep", "sweep"), ("studies.store", "write_dataset"), ("studies.store", "open_cases"))
+STUDIES = (
+    ("studies.sweep", "sweep"),
+    ("studies", "open_cases"),
+    ("studies.store", "write_dataset"),
+    ("studies.store", "open_result"),
+)
 
 HEAD = """# API reference
 

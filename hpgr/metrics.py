@@ -43,7 +43,7 @@ def passing(dataset: xr.Dataset, sieves=None, point: int = -1, total: bool = Fal
     >>> float(hpgr.passing(dataset, [0.06], total=True)[0])
     1.0
     """
-    _require_sizes(dataset)
+    _require_sizes(dataset, point)
     if sieves is not None and not (np.asarray(sieves, dtype=float) > 0).all():
         raise ValueError(f"sieves: got {sieves!r}; must be sizes above 0 in m; such as [0.001]")
     if "size" in dataset:
@@ -79,7 +79,7 @@ def percentile_size(dataset: xr.Dataset, percent: float, point: int = -1, total:
     >>> bool(hpgr.percentile_size(dataset, 80, total=True) == dataset["p80_total"])
     True
     """
-    _require_sizes(dataset)
+    _require_sizes(dataset, point)
     if not 0 <= percent <= 100:
         raise ValueError(f"percent: got {percent}; must be within 0 to 100; P80 is percent=80")
     name = f"p{percent:g}" + ("_total" if total else "")
@@ -175,9 +175,14 @@ def gap_throughput(scene: Scene, exit_solid_fraction: float) -> float:
     return scene.material.solid_density * exit_solid_fraction * rolls.gap * rolls.width * surface_speed
 
 
-def _require_sizes(dataset: xr.Dataset) -> None:
+def _require_sizes(dataset: xr.Dataset, point: int) -> None:
     if "passing" not in dataset:
         raise ValueError("the Dataset holds no sizes: it is stress only (resolution.cells = 0); simulate it with cells")
+    points = dataset.sizes.get("point")
+    if points is not None and not -points <= point < points:
+        raise ValueError(
+            f"point: got {point}; must be within {-points} to {points - 1}, entry to exit; take -1 for the exit"
+        )
 
 
 def _steady(recorded: xr.DataArray) -> xr.DataArray:
@@ -263,8 +268,8 @@ def _percentile_between_sieves(found: xr.DataArray, fraction: float, total: bool
             return np.nan
         if not fractions[0] <= fraction <= fractions[-1]:
             raise ValueError(
-                f"percent: got {fraction:.0%}; the recorded sieves pass {fractions[0]:.3%} to {fractions[-1]:.3%}; "
-                "extend resolution.sieves, or record 'cells'"
+                f"percent: got {100 * fraction:g}; must lie within what the recorded sieves pass, "
+                f"{100 * fractions[0]:.3g} to {100 * fractions[-1]:.3g} %; extend resolution.sieves, or record 'cells'"
             )
         first = int(np.searchsorted(fractions, fraction))  # the finest sieve that passes it
         if first == 0 or fractions[first] == fraction:

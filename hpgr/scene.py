@@ -7,6 +7,7 @@ lists every fault at once, each with field, value, bound and remedy.
 
 import difflib
 import itertools
+import json
 import math
 import numbers
 import operator
@@ -82,7 +83,10 @@ def _sieve_rows(value: Any) -> Any:
     if isinstance(value, str | Path):
         try:
             return tables.read_sieve_table(value)
-        except (OSError, ValueError) as error:
+        except OSError as error:
+            reason = f"the file cannot be read ({error.strerror})"
+            raise PydanticCustomError("table", "{reason}", {"reason": reason}) from None
+        except ValueError as error:
             raise PydanticCustomError("table", "{reason}", {"reason": str(error)}) from None
     return value
 
@@ -215,7 +219,7 @@ def _explained(cls: type[_Frozen], error: Any) -> InitErrorDetails:
     extra = (field.json_schema_extra if field else None) or {}
     unit, remedy, value = (
         extra.get("unit", "1"),
-        extra.get("remedy", "see the field's description"),
+        extra.get("remedy") or _remedy(cls, field),
         error["input"],
     )
     plain = isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) < 1e300)
@@ -234,6 +238,8 @@ def _explained(cls: type[_Frozen], error: Any) -> InitErrorDetails:
         limit = units.parse(value, unit) if isinstance(value, str) and unit != "1" else None
         text = units.show(limit, unit) if limit is not None else text
         bound = f"{words} {units.show(error['ctx'][key], unit)}"
+    elif kind in {"model_type", "model_attributes_type"}:
+        bound = "must be a table of fields"
     elif kind == "finite_number":
         bound = "must be finite"
     elif kind == "literal_error":
@@ -244,6 +250,15 @@ def _explained(cls: type[_Frozen], error: Any) -> InitErrorDetails:
     return InitErrorDetails(
         type=PydanticCustomError("refused", "{text}", {"text": str(fault)}), loc=location, input=value
     )
+
+
+def _remedy(cls: type[_Frozen], field: Any) -> str:
+    """Return what to give where no remedy is carried: a field that is a part, a word or a switch, or `cls` itself."""
+    part = _part(field) if field else cls
+    if part is not None:
+        return f"give its fields: {', '.join(part.model_fields)}"
+    words = [repr(word) for word in get_args(field.annotation)]
+    return f"choose one of {', '.join(words)}" if words else "see the field's description"
 
 
 class Rolls(_Frozen):
@@ -802,8 +817,15 @@ class Scene(_Frozen):
         True
         """
         path = Path(path)
-        text = path.read_text(encoding="utf-8")
+        try:
+            text = path.read_text(encoding="utf-8")
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{path}: byte {error.start} is not UTF-8; save the scene as text in UTF-8") from None
         if path.suffix == ".json":
+            try:
+                json.loads(text)
+            except json.JSONDecodeError as error:
+                raise ValueError(f"{path}: not JSON: {error}; write it by Scene.model_dump_json()") from None
             return cls.model_validate_json(text)
         try:
             data = tomllib.loads(text)

@@ -37,8 +37,11 @@ def read_sieve_table(path: str | Path) -> list[tuple[float, float]]:
     >>> rows[-1]
     (0.045, 100.0)
     """
-    with open(path, newline="", encoding="utf-8-sig") as file:
-        lines = [line for line in file if line.strip() and not line.lstrip().startswith("#")]
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            lines = [line for line in file if line.strip() and not line.lstrip().startswith("#")]
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: byte {error.start} is not UTF-8; save the table as CSV in UTF-8") from None
     if not lines:
         raise ValueError(f"{path}: the table is empty; give a header and rows of size, percent passing")
     header, *rows = csv.reader(lines)
@@ -65,7 +68,9 @@ def _numbers(row: list[str], number: int, path) -> tuple[float, float]:
     try:
         size, percent = map(float, row)
     except ValueError:
-        raise ValueError(f"{path}: row {number} {','.join(row)!r} is not two numbers (size, percent passing)") from None
+        raise ValueError(
+            f"{path}: row {number} {','.join(row)!r} is not two numbers (size, percent passing); correct or remove it"
+        ) from None
     return size, percent
 
 

@@ -96,6 +96,16 @@ def open_result(path: str | Path) -> xr.Dataset:
         If it would have the library read other files or load filters, or is no NetCDF file.
     OSError
         If it cannot be read.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from studies.store import open_result, write_dataset
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_dataset(hpgr.simulate(hpgr.presets.paper()), Path(folder) / "one.nc")
+    ...     with open_result(Path(folder) / "one.nc") as dataset:
+    ...         dataset["p80"].dims
+    ('streamline',)
     """
     refuse_foreign_storage(path)
     with _LIBRARY:
