@@ -95,6 +95,8 @@ def nip_angle(machine: Machine, opening: float) -> float:
 
     Examples
     --------
+    >>> import math
+    >>> from hpgr.baselines import Machine, nip_angle
     >>> pilot = Machine(0.8, 0.25, 2740.0, 1630.0, 2300.0)
     >>> round(math.degrees(nip_angle(pilot, 0.0237)), 1)
     9.1
@@ -114,6 +116,7 @@ def throughput(machine: Machine, opening: float, speed: float) -> float:
 
     Examples
     --------
+    >>> from hpgr.baselines import Machine, throughput
     >>> pilot = Machine(0.8, 0.25, 2740.0, 1630.0, 2300.0)
     >>> round(throughput(pilot, opening=0.0237, speed=0.67), 2)  # kg/s
     9.13
@@ -126,6 +129,7 @@ def pressing_force(machine: Machine, hydraulic_pressure: float) -> float:
 
     Examples
     --------
+    >>> from hpgr.baselines import Machine, pressing_force
     >>> pilot = Machine(0.8, 0.25, 2740.0, 1630.0, 2300.0)
     >>> round(pressing_force(pilot, hydraulic_pressure=41e5))  # N
     410000
@@ -138,6 +142,8 @@ def power(force: float, angle: float, speed: float) -> float:
 
     Examples
     --------
+    >>> import math
+    >>> from hpgr.baselines import power
     >>> round(power(force=410e3, angle=math.radians(9.1), speed=0.67))  # W
     43583
     """
@@ -149,6 +155,7 @@ def power_shares(blocks: int) -> np.ndarray:
 
     Examples
     --------
+    >>> from hpgr.baselines import power_shares
     >>> power_shares(3) * 19
     array([5., 9., 5.])
     """
@@ -166,6 +173,7 @@ def breakage(parameters: TorresCasali, sizes: np.ndarray) -> np.ndarray:
 
     Examples
     --------
+    >>> from hpgr.baselines import TorresCasali, breakage
     >>> ore = TorresCasali(0.5, 1.0, 1.0, 1e-4, 0.0, 0.0, 0.2)  # fragments uniform in size
     >>> breakage(ore, [1e-3, 2e-3, 4e-3])
     array([[0. , 0. , 0. ],
@@ -185,6 +193,7 @@ def selection(parameters: TorresCasali, sizes: np.ndarray, reference_size: float
 
     Examples
     --------
+    >>> from hpgr.baselines import TorresCasali, coarsest_class, selection
     >>> ore = TorresCasali(0.5, 1.0, 1.0, 1e-4, 1.0, 0.0, 0.2)  # in proportion to size
     >>> selection(ore, [1e-3, 2e-3, 4e-3], reference_size=coarsest_class([1e-3, 2e-3, 4e-3]))
     array([1.e-04, 5.e-05, 0.e+00])
@@ -199,6 +208,7 @@ def coarsest_class(sizes: np.ndarray) -> float:
 
     Examples
     --------
+    >>> from hpgr.baselines import coarsest_class
     >>> round(coarsest_class([1e-3, 4.0, 9.0]), 3)
     6.0
     """
@@ -214,6 +224,8 @@ def block_products(parameters, sizes, feed, specific_energy, reference_size) -> 
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from hpgr.baselines import TorresCasali, block_products
     >>> ore = TorresCasali(0.5, 1.0, 1.0, 1e-4, 1.0, 0.0, 0.2)
     >>> energies = np.array([0.0, 5000.0])  # J/kg, of two blocks
     >>> block_products(ore, [1e-3, 2e-3, 4e-3], [0.0, 0.0, 1.0], energies, 2.8e-3).round(2)
@@ -248,6 +260,7 @@ def edge_weights(blocks: int, edge_share: float) -> np.ndarray:
 
     Examples
     --------
+    >>> from hpgr.baselines import edge_weights
     >>> edge_weights(3, 0.21)
     array([0.5, 0. , 0.5])
     """
@@ -261,6 +274,8 @@ def combine(blocks: np.ndarray, edge_share: float) -> dict[str, np.ndarray]:
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from hpgr.baselines import combine
     >>> found = combine(np.array([[1.0, 0.0], [0.2, 0.8], [1.0, 0.0]]), edge_share=0.2)
     >>> found["edge"], found["total"].round(2)
     (array([1., 0.]), array([0.73, 0.27]))
@@ -329,6 +344,7 @@ def fit_torres_casali(
     --------
     >>> import hpgr
     >>> from hpgr.tables import read_pilot_tests
+    >>> from hpgr.baselines import Machine, TorresCasali, fit_torres_casali
     >>> folder = hpgr.presets.DATA
     >>> tests = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
     >>> published = TorresCasali(0.20, 0.20, 3.51, 0.66 / 3600, -1.26, -0.70, 0.22)._asdict()
@@ -383,6 +399,7 @@ def decay(parameters: HindeKalala, sizes: np.ndarray, reference_size: float) -> 
 
     Examples
     --------
+    >>> from hpgr.baselines import HindeKalala, decay
     >>> ore = HindeKalala(1e-4, 1.0, 0.0, 2.0, 0.2, 0.5)
     >>> decay(ore, [1e-3, 2e-3, 4e-3], reference_size=4e-3)
     array([2.5e-05, 5.0e-05, 1.0e-04])
@@ -401,6 +418,7 @@ def retained(parameters, sizes, feed, specific_energy, reference_size) -> np.nda
 
     Examples
     --------
+    >>> from hpgr.baselines import HindeKalala, retained
     >>> ore = HindeKalala(1e-4, 1.0, 0.0, 2.0, 0.2, 0.5)
     >>> retained(ore, [1e-3, 2e-3, 4e-3], [0.0, 0.0, 1.0], specific_energy=5000.0, reference_size=4e-3).round(2)
     array([0.88, 0.78, 0.  ])
@@ -445,6 +463,7 @@ def fit_hinde_kalala(tests: Sequence[PilotTest], fixed: Mapping[str, float] | No
     --------
     >>> import hpgr
     >>> from hpgr.tables import read_pilot_tests
+    >>> from hpgr.baselines import fit_hinde_kalala
     >>> folder = hpgr.presets.DATA
     >>> tests = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
     >>> fixed = {"bend": 0.0, "coarse_exponent": 1.0, "edge_share": 0.18, "edge_energy": 0.5}
@@ -502,8 +521,10 @@ def rmse(prediction: Prediction, test: PilotTest) -> dict[str, float]:
 
     Examples
     --------
+    >>> import math
     >>> import hpgr
     >>> from hpgr.tables import read_pilot_tests
+    >>> from hpgr.baselines import Prediction, rmse
     >>> folder = hpgr.presets.DATA
     >>> [test, *_] = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
     >>> perfect = Prediction(test.sizes, test.centre, test.edge, test.total, math.nan, math.nan, math.nan)

@@ -202,6 +202,7 @@ def fit_tests(scene: Scene, tests: Sequence[PilotTest], fit: Sequence[str], feed
     --------
     >>> import hpgr
     >>> from hpgr import calibration
+    >>> from hpgr.tables import read_pilot_tests
     >>> folder = hpgr.presets.DATA
     >>> tests = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
     >>> coarse = {"resolution.points": 40, "resolution.streamlines": 1, "material.cushioning": float("inf")}
@@ -302,6 +303,7 @@ def predict(scene: Scene, test: PilotTest, feed: Feed | None = None, floating: b
     --------
     >>> import hpgr
     >>> from hpgr import calibration
+    >>> from hpgr.tables import read_pilot_tests
     >>> folder = hpgr.presets.DATA
     >>> [first, *_] = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
     >>> stress_only = hpgr.presets.khd_pilot().with_values({"resolution.cells": 0})

@@ -23,6 +23,7 @@ def critical_size(log_stress, material: Material) -> np.ndarray:
 
     Examples
     --------
+    >>> import numpy as np
     >>> import hpgr
     >>> from hpgr import limits
     >>> ore = hpgr.Material(weibull_modulus=3)
@@ -66,6 +67,7 @@ def percentile(passing, fraction, coarsest: float) -> np.ndarray:
 
     Examples
     --------
+    >>> import numpy as np
     >>> from hpgr import limits
     >>> limits.percentile(lambda size: size / 0.01, np.array([0.5, 0.8]), coarsest=0.01)
     array([0.005, 0.008])
@@ -86,6 +88,7 @@ def expected_breaks(feed: Feed, critical, gamma: float) -> np.ndarray:
 
     Examples
     --------
+    >>> import numpy as np
     >>> import hpgr
     >>> from hpgr import limits
     >>> boulders = hpgr.Feed(kind="single", size=0.05)

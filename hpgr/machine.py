@@ -67,8 +67,9 @@ def press(scene: Scene, walled: Geometry, motion: Motion, state: Load) -> Press:
 
     Examples
     --------
+    >>> import numpy as np
     >>> import hpgr
-    >>> from hpgr import machine
+    >>> from hpgr import flow, geometry, machine, stress
     >>> scene = hpgr.presets.industrial()
     >>> bed = geometry.bed(scene.rolls, 4)
     >>> walled = bed._replace(xi=np.append(bed.xi, 1.0))

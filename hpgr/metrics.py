@@ -237,6 +237,7 @@ def between_sieves(found: xr.DataArray, wanted: np.ndarray) -> xr.DataArray:
 
     Examples
     --------
+    >>> import numpy as np
     >>> import xarray as xr
     >>> from hpgr import metrics
     >>> found = xr.DataArray([0.2, 0.6], {"sieve": [1e-3, 4e-3]}, "sieve")

@@ -808,6 +808,7 @@ class Scene(_Frozen):
 
         Examples
         --------
+        >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
         >>> import hpgr
         >>> with TemporaryDirectory() as folder:

@@ -65,6 +65,9 @@ def write_dataset(dataset: xr.Dataset, path: str | Path) -> None:
 
     Examples
     --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import xarray as xr
     >>> import hpgr
     >>> from studies.store import write_dataset
     >>> dataset = hpgr.simulate(hpgr.presets.paper().with_values({"resolution.cells": 0}))
@@ -99,6 +102,8 @@ def open_result(path: str | Path) -> xr.Dataset:
 
     Examples
     --------
+    >>> import tempfile
+    >>> from pathlib import Path
     >>> import hpgr
     >>> from studies.store import open_result, write_dataset
     >>> with tempfile.TemporaryDirectory() as folder:

@@ -212,9 +212,9 @@ def test_every_public_function_has_an_example(api):
     assert not skipped, "these examples do not run"
 
 
-@pytest.mark.parametrize("name", ["studies.sweep", "studies.store"])
+@pytest.mark.parametrize("name", ["studies.sweep", "studies.store", "studies.recorded"])
 def test_examples_of_studies(name):
     """Those of hpgr run in tests/test_pipeline.py."""
-    found = doctest.testmod(importlib.import_module(name))
+    found = doctest.testmod(importlib.import_module(name), globs={})
     assert found.failed == 0
     assert found.attempted > 3
