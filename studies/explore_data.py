@@ -209,7 +209,7 @@ def with_sieve(result: xr.Dataset, sieve: float, coarsest: float) -> xr.Dataset:
     if not known[0] <= sieve <= known[-1]:
         raise ValueError(
             f"--sieve: got {units.show(sieve, 'm')}; must lie within the recorded sieves, "
-            f"{units.show(known[0], 'm')} to {units.show(known[-1], 'm')}"
+            f"{units.show(known[0], 'm')} to {units.show(known[-1], 'm')}; choose one within"
         )
     across = [name for name in kept["passing_total"].dims if name != "sieve"]
     first = max(int(np.argmax(kept["passing_total"].max(across).values > 0)) - 1, 0)

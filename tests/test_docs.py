@@ -1,7 +1,9 @@
-"""The documents: every block of Python runs and prints what it says, every command line is taken by its study."""
+"""The documents: Python runs and prints what it says, command lines are taken, and the API page is up to date.
+
+The README's own code, and the examples in docstrings, run in tests/test_ready.py and tests/test_pipeline.py.
+"""
 
 import dataclasses
-import doctest
 import importlib
 import importlib.util
 import inspect
@@ -20,7 +22,6 @@ import hpgr
 import studies
 from hpgr import schema
 from hpgr.scene import Scene
-from studies import gap_sweep
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -94,16 +95,6 @@ def test_what_is_printed_must_be_near(printed, told):
     assert_near([told], [told], "itself")
     with pytest.raises((AssertionError, ValueError)):
         assert_near([printed], [told], "another")
-
-
-def test_readme_runs(folder, capfd):
-    small = ["--cells", "40", "--points", "30", "--streamlines", "2", "--replicates", "1", "--no-plot"]
-    assert gap_sweep.main(small) == 0
-    [toml] = blocks(ROOT / "README.md", "toml")
-    Path("my_sieves.csv").write_text("size_mm,percent_passing\n1,5\n20,60\n45,100\n")
-    Path("mine.toml").write_text(toml + "\n[resolution]\nstreamlines = 2\npoints = 21\ncells = 20\n")
-    assert Scene.from_file("mine.toml").feed.kind == "table"
-    run(ROOT / "README.md")
 
 
 def code(page):
@@ -210,11 +201,3 @@ def test_every_public_function_has_an_example(api):
     assert not missing, "give these an Examples section"
     skipped = [name for name, thing in wanted.items() if "+SKIP" in inspect.getdoc(thing)]
     assert not skipped, "these examples do not run"
-
-
-@pytest.mark.parametrize("name", ["studies.sweep", "studies.store", "studies.recorded"])
-def test_examples_of_studies(name):
-    """Those of hpgr run in tests/test_pipeline.py."""
-    found = doctest.testmod(importlib.import_module(name), globs={})
-    assert found.failed == 0
-    assert found.attempted > 3
