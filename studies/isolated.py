@@ -18,7 +18,7 @@ from typing import BinaryIO
 from hpgr import pipeline
 from hpgr.scene import Scene
 from studies.bench import Bench, Case, Job, Outcome, run_case
-from studies.cases import outcome_of, pack_outcome, read_packed
+from studies.cases import code_version, outcome_of, pack_outcome, read_packed
 
 _START = 300.0  # s that a child may take to start: it may have to compile
 _IDLE = 60.0  # s without work after which a child ends itself
@@ -124,6 +124,8 @@ def serve() -> None:
     job = json.loads(questions.readline())
     at_once = job.pop("at_once")
     job = Job(**job | {"base": Scene.model_validate_json(job["base"])})
+    if job.code and job.code != code_version():
+        sys.exit("hpgr or its libraries have changed since the sweep began; start it again")
     _warm_up(job.base)
     bench = Bench(job, at_once)
     _answer(answers, Outcome((), "ok", "ready", {}))

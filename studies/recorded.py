@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 _MANIFEST = "sweep.json"
 _FORMAT = 1
+_IN_FILES = {"time": "photograph"}  # names that differ in files, see `store.write_dataset`
 
 
 def write_case(outcome: Outcome, address: str, path: Path) -> None:
@@ -112,7 +113,8 @@ def open_cases(folder: str | Path) -> "xr.Dataset":
         entry = schema.COORDINATES.get(name) or schema.VARIABLES[name]
         variable = ((*dims, *entry.dims), _lazy(files, name, shapes[name], np.dtype(entry.dtype)))
         if name in ("xi", "sieve", "time"):  # the same for every case
-            found.coords[name] = (entry.dims, store.read_variable(first, name), schema.attributes(name))
+            values = store.read_variable(first, _IN_FILES.get(name, name))
+            found.coords[name] = (entry.dims, values, schema.attributes(name))
         elif name in schema.COORDINATES:
             found.coords[name] = (*variable, schema.attributes(name))
         else:
@@ -149,6 +151,7 @@ def _shapes(paths: list[str]) -> dict[str, tuple[int, ...] | None]:
     shapes: dict[str, tuple[int, ...] | None] = {}
     for path in paths:
         for name, shape in store.shapes_in(path).items():
+            name = {stored: own for own, stored in _IN_FILES.items()}.get(name, name)
             if name in schema.COORDINATES or name in schema.VARIABLES:
                 shapes[name] = shape if shapes.get(name, shape) == shape else None
     return shapes

@@ -484,3 +484,51 @@ def test_import_loads_nothing_heavy():
     loaded = set(done.stdout.split())
     assert "studies.command" in loaded
     assert not loaded & set(_LATE)
+
+
+def test_gap_floats_under_a_swept_pressing_force(run):
+    code, out, err = run("--press-force", "3 N/mm^2", "4.5 MPa", "--scene", "industrial", "--replicates", "1")
+    assert code == 0, err
+    assert "gap floats under the pressing force" in out
+    result = opened("outputs/gap_sweep.nc")
+    assert result["p80_total"].dims == ("press_force", "replicate")
+    assert result["press_force"].values.tolist() == [3e6, 4.5e6]
+    assert result["specific_pressing_force"].values[:, 0] == pytest.approx([3e6, 4.5e6], rel=1e-6)
+    gaps = result["operating_gap"].values[:, 0]
+    assert 0.02 < gaps[1] < gaps[0] < 0.1
+    heading = next(line for line in out.splitlines() if "Fsp" in line)
+    for figure in ("gap [mm]", "Fsp [N/mm²]", "power [kW]", "W [kWh/t]", "torque [kN m]", "beta [deg]"):
+        assert figure in heading
+
+
+def test_pressing_force_is_a_further_axis_of_the_other_sweeps(run):
+    code, _, err = run(
+        "--press-force", "3 MPa", "--roll-speed", "10 rpm", "20 rpm", "--scene", "industrial", "--replicates", "1",
+        "--no-plot", study=speed_sweep,
+    )  # fmt: skip
+    assert code == 0, err
+    result = opened("outputs/speed_sweep.nc")
+    assert result["power"].dims == ("roll_speed", "press_force", "replicate")
+    assert result["power"].values[1, 0, 0] == pytest.approx(2 * result["power"].values[0, 0, 0], rel=1e-6)
+
+
+def test_force_that_no_gap_carries_is_named_with_the_reachable_range(run):
+    code, _, err = run("--press-force", "3 MPa", "80 MPa", "--scene", "industrial", "--replicates", "1", "--no-plot")
+    assert code == 1
+    assert "80 MPa" in err
+    assert "reachable" in err
+
+
+def test_gap_beside_a_pressing_force_is_refused(refused, folder):
+    assert "--press-force" in refused("--gap", "40 mm", "--press-force", "3 MPa")
+    assert "MPa" in refused("--press-force", "3")
+    assert "specific_pressing_force" in refused("--press-force", "3 mm")
+
+
+def test_gap_sweep_of_a_scene_whose_gap_floats_is_refused(run, folder):
+    floating = SCENE.replace('gap = "19 mm"', 'gap = "19 mm"\nspecific_pressing_force = "2 N/mm^2"')
+    (folder / "mine.toml").write_text(floating)
+    code, _, err = run("--scene", "mine.toml")
+    assert code == 2
+    assert "rolls.gap" in err
+    assert "floats" in err
