@@ -47,6 +47,7 @@ def page_data(result: xr.Dataset, sieve: float, name: str) -> dict[str, Any]:
     Examples
     --------
     >>> import hpgr
+    >>> from studies.explore_data import page_data
     >>> from studies.sweep import sweep
     >>> base = hpgr.presets.paper().with_values({"resolution.cells": 100, "resolution.points": 50})
     >>> data = page_data(sweep(base, {"rolls.gap": ["40 mm", "60 mm"]}), 0.001, "two gaps")
@@ -142,6 +143,8 @@ def numbers(values: np.ndarray, digits: int = DIGITS) -> list:
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from studies.explore_data import numbers
     >>> numbers(np.array([0.123456789, 3.0, np.nan]))
     [0.123457, 3, None]
     """
