@@ -106,8 +106,9 @@ def open_result(path: str | Path) -> xr.Dataset:
     >>> from pathlib import Path
     >>> import hpgr
     >>> from studies.store import open_result, write_dataset
+    >>> small = hpgr.presets.paper().with_values({"resolution.cells": 50, "resolution.points": 40})
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_dataset(hpgr.simulate(hpgr.presets.paper()), Path(folder) / "one.nc")
+    ...     write_dataset(hpgr.simulate(small), Path(folder) / "one.nc")
     ...     with open_result(Path(folder) / "one.nc") as dataset:
     ...         dataset["p80"].dims
     ('streamline',)
