@@ -29,7 +29,7 @@ def main(names: Sequence[str]) -> int:
     """Make these pictures, or all, and return the exit code: 1 if a study could not draw its own."""
     unknown = sorted(set(names) - set(PICTURES))
     if unknown:
-        print(f"error: got {', '.join(unknown)}; must be of {', '.join(PICTURES)}", file=sys.stderr)
+        print(f"error: got {', '.join(unknown)}; must be among {', '.join(PICTURES)}", file=sys.stderr)
         return 2
     wanted = names or list(PICTURES)
     for study, out in dict.fromkeys(PICTURES[name] for name in wanted):

@@ -92,6 +92,14 @@ def nip_angle(machine: Machine, opening: float) -> float:
     ------
     ValueError
         If no angle does that, because the opening is too wide for the rolls.
+
+    Examples
+    --------
+    >>> import math
+    >>> from hpgr.baselines import Machine, nip_angle
+    >>> pilot = Machine(0.8, 0.25, 2740.0, 1630.0, 2300.0)
+    >>> round(math.degrees(nip_angle(pilot, 0.0237)), 1)
+    9.1
     """
     wide = opening + machine.diameter
     root = wide**2 - 4 * opening * machine.diameter * machine.cake_density / machine.bulk_density
@@ -104,25 +112,50 @@ def nip_angle(machine: Machine, opening: float) -> float:
 
 
 def throughput(machine: Machine, opening: float, speed: float) -> float:
-    """Return cake_density * opening * width * speed (kg s-1)."""
+    """Return cake_density * opening * width * speed (kg s-1).
+
+    Examples
+    --------
+    >>> from hpgr.baselines import Machine, throughput
+    >>> pilot = Machine(0.8, 0.25, 2740.0, 1630.0, 2300.0)
+    >>> round(throughput(pilot, opening=0.0237, speed=0.67), 2)  # kg/s
+    9.13
+    """
     return machine.cake_density * opening * machine.width * speed
 
 
 def pressing_force(machine: Machine, hydraulic_pressure: float) -> float:
-    """Return F = R_p (D/2) L (N), which is the printed 100 R_p (D/2) L with bar and kN."""
+    """Return F = R_p (D/2) L (N), which is the printed 100 R_p (D/2) L with bar and kN.
+
+    Examples
+    --------
+    >>> from hpgr.baselines import Machine, pressing_force
+    >>> pilot = Machine(0.8, 0.25, 2740.0, 1630.0, 2300.0)
+    >>> round(pressing_force(pilot, hydraulic_pressure=41e5))  # N
+    410000
+    """
     return hydraulic_pressure * machine.diameter / 2 * machine.width
 
 
 def power(force: float, angle: float, speed: float) -> float:
-    """Return 2 F sin(angle/2) U (W) of both rolls."""
+    """Return 2 F sin(angle/2) U (W) of both rolls.
+
+    Examples
+    --------
+    >>> import math
+    >>> from hpgr.baselines import power
+    >>> round(power(force=410e3, angle=math.radians(9.1), speed=0.67))  # W
+    43583
+    """
     return 2 * force * math.sin(angle / 2) * speed
 
 
 def power_shares(blocks: int) -> np.ndarray:
     """Return the (block,) shares of the power: parabolic across the width, zero at its two ends.
 
-    Example
-    -------
+    Examples
+    --------
+    >>> from hpgr.baselines import power_shares
     >>> power_shares(3) * 19
     array([5., 9., 5.])
     """
@@ -137,6 +170,15 @@ def breakage(parameters: TorresCasali, sizes: np.ndarray) -> np.ndarray:
     Classes run from coarse to fine: between the sieves, and below the finest. The fragments of class j
     all pass its lower sieve: b_ij = B(top of i / bottom of j) - B(bottom of i / bottom of j). With sieves
     in one ratio that is the printed B_{i-j+1} - B_{i-j+2}. Every column but the last adds up to 1.
+
+    Examples
+    --------
+    >>> from hpgr.baselines import TorresCasali, breakage
+    >>> ore = TorresCasali(0.5, 1.0, 1.0, 1e-4, 0.0, 0.0, 0.2)  # fragments uniform in size
+    >>> breakage(ore, [1e-3, 2e-3, 4e-3])
+    array([[0. , 0. , 0. ],
+           [0.5, 0. , 0. ],
+           [0.5, 1. , 0. ]])
     """
     sieves = np.asarray(sizes, dtype=float)[::-1]
     ratio = sieves[:, None] / np.append(sieves[1:], np.inf)  # (top of class i, bottom of class j)
@@ -147,14 +189,29 @@ def breakage(parameters: TorresCasali, sizes: np.ndarray) -> np.ndarray:
 
 
 def selection(parameters: TorresCasali, sizes: np.ndarray, reference_size: float) -> np.ndarray:
-    """Return the rates per specific energy (class,), kg J-1, coarse to fine; the class below the sieves is kept."""
+    """Return the rates per specific energy (class,), kg J-1, coarse to fine; the class below the sieves is kept.
+
+    Examples
+    --------
+    >>> from hpgr.baselines import TorresCasali, coarsest_class, selection
+    >>> ore = TorresCasali(0.5, 1.0, 1.0, 1e-4, 1.0, 0.0, 0.2)  # in proportion to size
+    >>> selection(ore, [1e-3, 2e-3, 4e-3], reference_size=coarsest_class([1e-3, 2e-3, 4e-3]))
+    array([1.e-04, 5.e-05, 0.e+00])
+    """
     sieves = np.asarray(sizes, dtype=float)[::-1]
     log = np.log(np.sqrt(sieves[:-1] * sieves[1:]) / reference_size)
     return np.append(parameters.selection * np.exp(parameters.slope * log + parameters.curvature * log**2), 0.0)
 
 
 def coarsest_class(sizes: np.ndarray) -> float:
-    """Return the geometric mean (m) of the two coarsest sieves, the x_1 of the selection function."""
+    """Return the geometric mean (m) of the two coarsest sieves, the x_1 of the selection function.
+
+    Examples
+    --------
+    >>> from hpgr.baselines import coarsest_class
+    >>> round(coarsest_class([1e-3, 4.0, 9.0]), 3)
+    6.0
+    """
     return math.sqrt(sizes[-1] * sizes[-2])
 
 
@@ -164,6 +221,16 @@ def block_products(parameters, sizes, feed, specific_energy, reference_size) -> 
     Along z the plug flow obeys v_z dm_i/dz = sum_{j<i} S_jk b_ij m_j - S_ik m_i with S_ik = S_i P_k/H_k
     over z* = (D/2) sin(nip angle). With H_k = Q z*/(U N) and v_z = U, z* cancels: the whole path is the
     exponential of the block's specific energy P_k N/Q times one matrix.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from hpgr.baselines import TorresCasali, block_products
+    >>> ore = TorresCasali(0.5, 1.0, 1.0, 1e-4, 1.0, 0.0, 0.2)
+    >>> energies = np.array([0.0, 5000.0])  # J/kg, of two blocks
+    >>> block_products(ore, [1e-3, 2e-3, 4e-3], [0.0, 0.0, 1.0], energies, 2.8e-3).round(2)
+    array([[1.  , 0.  , 0.  ],
+           [0.6 , 0.17, 0.22]])
     """
     rates = selection(parameters, sizes, reference_size)
     matrix = breakage(parameters, sizes) * rates - np.diag(rates)
@@ -191,8 +258,9 @@ def _exponentials(matrices: np.ndarray) -> np.ndarray:
 def edge_weights(blocks: int, edge_share: float) -> np.ndarray:
     """Return the (block,) weights of the edge product: half its share of the mass from each end.
 
-    Example
-    -------
+    Examples
+    --------
+    >>> from hpgr.baselines import edge_weights
     >>> edge_weights(3, 0.21)
     array([0.5, 0. , 0.5])
     """
@@ -202,7 +270,16 @@ def edge_weights(blocks: int, edge_share: float) -> np.ndarray:
 
 
 def combine(blocks: np.ndarray, edge_share: float) -> dict[str, np.ndarray]:
-    """Return what the product of equal blocks (block, class) is at the centre, at the edge and in total."""
+    """Return what the product of equal blocks (block, class) is at the centre, at the edge and in total.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from hpgr.baselines import combine
+    >>> found = combine(np.array([[1.0, 0.0], [0.2, 0.8], [1.0, 0.0]]), edge_share=0.2)
+    >>> found["edge"], found["total"].round(2)
+    (array([1., 0.]), array([0.73, 0.27]))
+    """
     total = blocks.mean(axis=0)
     edge = edge_weights(len(blocks), edge_share) @ blocks
     return {"centre": (total - edge_share * edge) / (1 - edge_share), "edge": edge, "total": total}
@@ -262,6 +339,19 @@ def fit_torres_casali(
     ------
     ValueError
         If tests, machine or fixed parameters cannot be fitted: one error that lists every fault.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr.tables import read_pilot_tests
+    >>> from hpgr.baselines import Machine, TorresCasali, fit_torres_casali
+    >>> folder = hpgr.presets.DATA
+    >>> tests = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
+    >>> published = TorresCasali(0.20, 0.20, 3.51, 0.66 / 3600, -1.26, -0.70, 0.22)._asdict()
+    >>> fixed = {name: value for name, value in published.items() if name != "selection"}
+    >>> found = fit_torres_casali(tests[:1], Machine(0.8, 0.25, 2740.0, 1630.0, 2300.0), fixed)
+    >>> found.settled, found.at_bounds
+    (True, ())
     """
     fixed = dict(fixed or {})
     faults = _machine_faults(machine) + _fit_faults(tests, TorresCasali, _TC_BOUNDS, fixed, {"edge_share"})
@@ -305,7 +395,15 @@ def _passing(masses: np.ndarray) -> np.ndarray:
 
 
 def decay(parameters: HindeKalala, sizes: np.ndarray, reference_size: float) -> np.ndarray:
-    """Return K (size,), kg J-1: it never falls with size, so that nothing can leave a class upwards."""
+    """Return K (size,), kg J-1: it never falls with size, so that nothing can leave a class upwards.
+
+    Examples
+    --------
+    >>> from hpgr.baselines import HindeKalala, decay
+    >>> ore = HindeKalala(1e-4, 1.0, 0.0, 2.0, 0.2, 0.5)
+    >>> decay(ore, [1e-3, 2e-3, 4e-3], reference_size=4e-3)
+    array([2.5e-05, 5.0e-05, 1.0e-04])
+    """
     ratio = np.asarray(sizes) / reference_size
     fine = (1 - parameters.bend) * ratio**parameters.exponent
     return parameters.rate * (fine + parameters.bend * ratio**parameters.coarse_exponent)
@@ -317,6 +415,13 @@ def retained(parameters, sizes, feed, specific_energy, reference_size) -> np.nda
     As a population balance: a class between the sieves x_j > x_{j+1} breaks at the rate K(x_{j+1}), the
     decay of the sieve below it, and of what breaks the share K(x)/K(x_{j+1}) passes the sieve x. With
     rates and fragments so tied ("compensation") the cumulative balance has this exact solution.
+
+    Examples
+    --------
+    >>> from hpgr.baselines import HindeKalala, retained
+    >>> ore = HindeKalala(1e-4, 1.0, 0.0, 2.0, 0.2, 0.5)
+    >>> retained(ore, [1e-3, 2e-3, 4e-3], [0.0, 0.0, 1.0], specific_energy=5000.0, reference_size=4e-3).round(2)
+    array([0.88, 0.78, 0.  ])
     """
     return (1 - np.asarray(feed)) * np.exp(-decay(parameters, sizes, reference_size) * specific_energy)
 
@@ -353,6 +458,18 @@ def fit_hinde_kalala(tests: Sequence[PilotTest], fixed: Mapping[str, float] | No
     ------
     ValueError
         If the tests or fixed parameters cannot be fitted: one error that lists every fault.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr.tables import read_pilot_tests
+    >>> from hpgr.baselines import fit_hinde_kalala
+    >>> folder = hpgr.presets.DATA
+    >>> tests = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
+    >>> fixed = {"bend": 0.0, "coarse_exponent": 1.0, "edge_share": 0.18, "edge_energy": 0.5}
+    >>> found = fit_hinde_kalala(tests[:1], fixed)
+    >>> round(found.energy_per_force * 2.5e6 / 3600, 2)  # kWh/t at 2.5 N/mm2, as measured
+    1.44
     """
     fixed = dict(fixed or {})
     faults = _fit_faults(tests, HindeKalala, _HK_BOUNDS, fixed, {"edge_share", "edge_energy"})
@@ -401,6 +518,18 @@ def rmse(prediction: Prediction, test: PilotTest) -> dict[str, float]:
     """Return the root mean square error in percent passing of centre, edge and total.
 
     It runs over every sieve where the curve was measured, the coarsest too; NaN if it was not.
+
+    Examples
+    --------
+    >>> import math
+    >>> import hpgr
+    >>> from hpgr.tables import read_pilot_tests
+    >>> from hpgr.baselines import Prediction, rmse
+    >>> folder = hpgr.presets.DATA
+    >>> [test, *_] = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
+    >>> perfect = Prediction(test.sizes, test.centre, test.edge, test.total, math.nan, math.nan, math.nan)
+    >>> rmse(perfect, test)
+    {'centre': 0.0, 'edge': 0.0, 'total': 0.0}
     """
     found = {}
     for name in PRODUCTS:

@@ -114,9 +114,10 @@ def refuse_too_large(scene: Scene, room: tuple[int, str] | None = None) -> None:
     needed = predict(scene).bytes
     available, limit = room or available_memory()
     if needed > _SHARE * available:
+        spare = "" if scene.resolution.record == "product" else "record 'product', or "
         raise MemoryError(
             f"resolution.cells: got {scene.resolution.cells} cells x {scene.resolution.points} points x "
             f"{scene.resolution.streamlines} streamlines, recording {scene.resolution.record}: predicted "
             f"{needed:,} bytes, must be at most {_SHARE:.0%} of the {available:,} bytes that {limit} leaves; "
-            "record 'product', or use fewer cells, points or photographs"
+            f"{spare}use fewer cells, points or photographs"
         )

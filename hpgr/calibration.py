@@ -19,6 +19,7 @@ from hpgr.scene import Feed, Scene, field_info
 from hpgr.tables import PilotTest, read_pilot_tests
 
 _PARTS, _MEASURED = ("centre", "edge", "total"), ("throughput", "power", "cake_thickness")
+_PRODUCT = "percent passing"
 _OF_MACHINE = ("K", "alpha", "T_0")  # fitted to what is measured of the machine; the others to the product
 _ROUNDS = 2
 _STEPS = (0.03, 0.01)  # of central differences, in the units below: wide first, or counting cells would show
@@ -129,8 +130,9 @@ class Calibration(NamedTuple):
         lines = [f"calibrated on {', '.join(self.residuals)}"]
         for name, found in self.estimates.items():
             value, low, high = (units.show(one, found.unit) for one in found[:3])
+            spread = f"{low} to {high}" if math.isfinite(found.high) else "any value"
             told = " (at its bound)" if name in self.at_bound else ""
-            lines.append(f"{name:>8} = {value} ({low} to {high}){told}")
+            lines.append(f"{name:>8} = {value} ({spread}){told}")
         if self.undetermined:
             lines.append(f"the tests do not tell apart {', '.join(self.undetermined)}")
         return "\n".join(lines)
@@ -185,14 +187,30 @@ def calibrate(
     ['sigma_m', 'gamma']
     """
     known = {test.name: test for test in read_pilot_tests(product, operations)}
-    unknown = [name for name in tests or () if name not in known]
-    if unknown:
-        raise ValueError(f"tests: got {unknown[0]!r}; must be of {', '.join(known)}; correct the name")
-    return fit_tests(scene, [known[name] for name in tests or known], fit, feed)
+    wanted = list(known) if tests is None else list(tests)
+    unknown = [repr(name) for name in wanted if name not in known]
+    if unknown or not wanted:
+        told = ", ".join(unknown) or "none"
+        raise ValueError(f"tests: got {told}; must be among {', '.join(known)}; correct the names, or leave it out")
+    return fit_tests(scene, [known[name] for name in wanted], fit, feed)
 
 
 def fit_tests(scene: Scene, tests: Sequence[PilotTest], fit: Sequence[str], feed: Feed | None = None) -> Calibration:
-    """Fit parameters of `scene` to tests, as `calibrate` does to those of files."""
+    """Fit parameters of `scene` to tests, as `calibrate` does to those of files.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr import calibration
+    >>> from hpgr.tables import read_pilot_tests
+    >>> folder = hpgr.presets.DATA
+    >>> tests = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
+    >>> coarse = {"resolution.points": 40, "resolution.streamlines": 1, "material.cushioning": float("inf")}
+    >>> scene = hpgr.presets.khd_pilot().with_values(coarse)
+    >>> found = calibration.fit_tests(scene, tests[:1], ["gamma"])
+    >>> found.estimates["gamma"].low < found.estimates["gamma"].value < found.estimates["gamma"].high
+    True
+    """
     names = _known_names(scene, fit)
     scene = _started(scene.with_values({"resolution.record": "product"}), names, tests[0], feed)
     trial = _Trial(scene, [_at_test(scene, test, feed) for test in tests], tests, names)
@@ -241,18 +259,18 @@ class _Trial:
         """Raise ValueError if there is too little to fit to, or no gap carries the forces to begin with."""
         for free, found, what in (
             (machine_part, self.machine(place), "throughput, power and cake thickness"),
-            (product_part, self.smooth_product(place), "percent passing"),
+            (product_part, self.smooth_product(place), _PRODUCT),
         ):
             symbols = ", ".join(self.names[k] for k in free)
             if found.size < len(free):
                 raise ValueError(
-                    f"fit: got {symbols}, which are fitted to {what}; must be at most as many as the {found.size} "
-                    "measured values; name fewer, or more tests"
+                    f"fit: got {symbols}, fitted to {what}; must be at most as many as the {found.size} values of "
+                    f"these; {_more_values(self.scene, what)}"
                 )
             if (found == _LOST).any():
                 raise ValueError(
-                    "scene: no gap carries the force of every test at the start; must be so to begin the fit; start "
-                    "from another bulk modulus (material.bulk_modulus, such as '600 MPa') or nip angle"
+                    "scene: no gap carries the force of every test with the moduli and nip angle that the fit begins "
+                    "with; one must; give another material.bulk_modulus, such as '600 MPa', or flow.nip_angle"
                 )
 
     def _missed(self, place: np.ndarray, names: Sequence[str], extra: dict[str, Any]) -> np.ndarray:
@@ -280,6 +298,18 @@ def predict(scene: Scene, test: PilotTest, feed: Feed | None = None, floating: b
 
     With `floating` off, the gap is the test's cake thickness, or its working gap where that was not measured, and the
     force follows instead.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr import calibration
+    >>> from hpgr.tables import read_pilot_tests
+    >>> folder = hpgr.presets.DATA
+    >>> [first, *_] = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
+    >>> stress_only = hpgr.presets.khd_pilot().with_values({"resolution.cells": 0})
+    >>> said = calibration.predict(stress_only, first)
+    >>> abs(said.power / first.power - 1) < 0.1
+    True
     """
     return _predict(_at_test(scene.with_values({"resolution.record": "product"}), test, feed, floating))
 
@@ -441,11 +471,19 @@ def _spread(residual: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.nd
     return np.where(lost, math.inf, spread), lost
 
 
+def _more_values(scene: Scene, what: str) -> str:
+    """Return what to do where there are fewer values than parameters."""
+    if what == _PRODUCT and not scene.resolution.cells:
+        return "resolution.cells = 0 has no product to compare: give the scene cells"
+    return "fit fewer, or give more tests"
+
+
 def _known_names(scene: Scene, fit: Sequence[str]) -> list[str]:
     names = list(dict.fromkeys(fit))
     unknown = [name for name in names if name not in PARAMETERS]
     if unknown or not names:
-        raise ValueError(f"fit: got {', '.join(unknown) or 'nothing'}; must be of {', '.join(PARAMETERS)}; name some")
+        told = ", ".join(unknown) or "nothing"
+        raise ValueError(f"fit: got {told}; must be among {', '.join(PARAMETERS)}; correct the symbols, or name some")
     if "alpha" in names and scene.flow.profile != "nip":
         raise ValueError("fit: got alpha; must be fitted with flow.profile = 'nip'; leave it out or take that profile")
     if "kappa" in names and scene.roll_width is None:

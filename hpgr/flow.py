@@ -108,6 +108,7 @@ def nip_angle(scene: Scene) -> float:
     Examples
     --------
     >>> import hpgr
+    >>> from hpgr.flow import nip_angle
     >>> cake = {"flow.nip_angle": None, "flow.cake_solid_fraction": 0.84}
     >>> round(nip_angle(hpgr.presets.khd_pilot().with_values(cake)), 3)
     0.16

@@ -20,6 +20,15 @@ def critical_size(log_stress, material: Material) -> np.ndarray:
     """Return the size in m above which grains break at log(sigma_a / sigma_m), at least the size floor.
 
     inf where there is no stress (log_stress = -inf).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import hpgr
+    >>> from hpgr import limits
+    >>> ore = hpgr.Material(weibull_modulus=3)
+    >>> limits.critical_size(np.log([1.0, 2.0, 4.0]), ore)
+    array([0.06 , 0.03 , 0.015])
     """
     with np.errstate(over="ignore"):  # a vanishing stress breaks no size: inf is the answer
         size = material.strength_size * np.exp(-np.asarray(log_stress) * (material.weibull_modulus / 3))
@@ -37,6 +46,14 @@ def crushed_passing(feed: Feed, size, critical, gamma: float) -> np.ndarray:
         x and s_c in m, broadcast against each other; s_c = inf leaves the feed as it is.
     gamma : float
         Fragment exponent.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr import limits
+    >>> boulders = hpgr.Feed(kind="single", size="50 mm")
+    >>> limits.crushed_passing(boulders, [1e-3, 4e-3, 8e-3], 8e-3, gamma=1)
+    array([0.125, 0.5  , 1.   ])
     """
     size, critical = np.broadcast_arrays(np.asarray(size, dtype=float), np.asarray(critical, dtype=float))
     crushed = (1 - feeds.passing(feed, critical)) * np.minimum(size / critical, 1.0) ** gamma  # 0 where s_c is inf
@@ -47,6 +64,13 @@ def percentile(passing, fraction, coarsest: float) -> np.ndarray:
     """Return the sizes in m at which `passing` reaches `fraction`, in the shape of the latter.
 
     `passing` rises with size and takes any axes before those of `fraction`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from hpgr import limits
+    >>> limits.percentile(lambda size: size / 0.01, np.array([0.5, 0.8]), coarsest=0.01)
+    array([0.005, 0.008])
     """
     low, high = np.full_like(fraction, np.log(_FINEST)), np.full_like(fraction, np.log(coarsest))
     inner = np.arange(1, _PARTS).reshape(-1, *(1,) * fraction.ndim) / _PARTS
@@ -61,6 +85,15 @@ def expected_breaks(feed: Feed, critical, gamma: float) -> np.ndarray:
     """Return the mean number of breaks per grain, the mean of 1 + gamma ln(s0 / s_c) over s0 >= s_c.
 
     Integrated by parts: (1 - F0(s_c)) + gamma int_{s_c} (1 - F0(s)) d ln s.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import hpgr
+    >>> from hpgr import limits
+    >>> boulders = hpgr.Feed(kind="single", size=0.05)
+    >>> float(limits.expected_breaks(boulders, 0.05 / np.e**2, gamma=1).round(6))  # 1 + gamma ln(s0/s_c)
+    3.0
     """
     critical = np.asarray(critical, dtype=float)
     start = np.log(np.minimum(critical, feed.coarsest))

@@ -64,6 +64,19 @@ def press(scene: Scene, walled: Geometry, motion: Motion, state: Load) -> Press:
     The normal stress on the roll is p + 2 q / 3 times `hpgr.flow.Gradient.across`, stress and strain rate being
     coaxial. Power is the integral of p eps_v rate + q eps_s rate over the bed where it compacts; of the mid-plane's
     side the area between two points is X |v_y| dt / N.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import hpgr
+    >>> from hpgr import flow, geometry, machine, stress
+    >>> scene = hpgr.presets.industrial()
+    >>> bed = geometry.bed(scene.rolls, 4)
+    >>> walled = bed._replace(xi=np.append(bed.xi, 1.0))
+    >>> motion = flow.move(scene, walled, points=200)
+    >>> pressed = machine.press(scene, walled, motion, stress.load(scene, motion))
+    >>> 1e6 < pressed.force < 1e8  # N per m of roll width
+    True
     """
     if walled.height == 0:
         return Press(0.0, 0.0, 0.0)
@@ -123,6 +136,14 @@ def figures(scene: Scene, pressed: Press, throughput: float) -> Figures:
     The force angle beta is that of sin(beta) = P / (2 F U), so that W = 2000 Fsp sin(beta) / mdot holds for
     W in kWh/t, Fsp in N/mm2 and mdot = Q / (D L U) in t s/(h m3), as far as power goes into the bed (idle_torque = 0).
     It is 0 where nothing is pressed.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr import machine
+    >>> found = machine.figures(hpgr.presets.industrial(), machine.Press(8e6, 4e5, 0.159), throughput=200.0)
+    >>> round(found.specific_pressing_force / 1e6, 2), found.specific_energy  # N/mm2, J/kg
+    (3.64, 2000.0)
     """
     rolls = scene.rolls
     surface_speed = rolls.speed * rolls.diameter / 2
@@ -142,7 +163,17 @@ def figures(scene: Scene, pressed: Press, throughput: float) -> Figures:
 
 
 def unusual(scene: Scene, found: Figures, exit_solid_fraction: float) -> str:
-    """Return in words what leaves the range of usual machines, or nothing."""
+    """Return in words what leaves the range of usual machines, or nothing.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr import machine
+    >>> scene = hpgr.presets.industrial()
+    >>> found = machine.figures(scene, machine.Press(8e6, 4e5, 0.159), throughput=200.0)
+    >>> machine.unusual(scene, found, exit_solid_fraction=0.85)
+    'specific energy 0.555556 kWh/t (usual 1 kWh/t to 3 kWh/t)'
+    """
     values = {
         "roll diameter": scene.rolls.diameter,
         "specific pressing force": found.specific_pressing_force,
@@ -212,6 +243,14 @@ def at_operating_gap(scene: Scene) -> Scene:
     ------
     ValueError
         If no gap carries that force.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr import machine
+    >>> scene = hpgr.presets.industrial().with_values({"rolls.specific_pressing_force": "4 N/mm^2"})
+    >>> round(machine.at_operating_gap(scene).rolls.gap, 4)
+    0.0538
     """
     wanted = scene.rolls.specific_pressing_force
     if wanted is None:

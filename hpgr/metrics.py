@@ -43,7 +43,7 @@ def passing(dataset: xr.Dataset, sieves=None, point: int = -1, total: bool = Fal
     >>> float(hpgr.passing(dataset, [0.06], total=True)[0])
     1.0
     """
-    _require_sizes(dataset)
+    _require_sizes(dataset, point)
     if sieves is not None and not (np.asarray(sieves, dtype=float) > 0).all():
         raise ValueError(f"sieves: got {sieves!r}; must be sizes above 0 in m; such as [0.001]")
     if "size" in dataset:
@@ -79,7 +79,7 @@ def percentile_size(dataset: xr.Dataset, percent: float, point: int = -1, total:
     >>> bool(hpgr.percentile_size(dataset, 80, total=True) == dataset["p80_total"])
     True
     """
-    _require_sizes(dataset)
+    _require_sizes(dataset, point)
     if not 0 <= percent <= 100:
         raise ValueError(f"percent: got {percent}; must be within 0 to 100; P80 is percent=80")
     name = f"p{percent:g}" + ("_total" if total else "")
@@ -97,6 +97,15 @@ def throughput(dataset: xr.Dataset, total: bool = False) -> xr.DataArray:
     """Return the solids through each stream tube of both half gaps, or through the whole gap, kg/s.
 
     Q = rho_s phi_exit s_b L U (model page, section 7), in equal parts.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> dataset = hpgr.simulate(hpgr.presets.paper().with_values({"resolution.cells": 0}))
+    >>> round(float(hpgr.throughput(dataset, total=True)) * 3.6)  # t/h
+    3075
+    >>> hpgr.throughput(dataset).dims
+    ('streamline',)
     """
     if total:
         return dataset["throughput"]
@@ -110,6 +119,13 @@ def peak_pressure(dataset: xr.Dataset, total: bool = False) -> xr.Dataset:
     """Return the largest mean stress (Pa) and its height above the minimum gap (m), as a Dataset.
 
     Variables `peak_pressure` and `peak_pressure_height`, per streamline or of the whole bed.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> dataset = hpgr.simulate(hpgr.presets.paper().with_values({"resolution.cells": 0}))
+    >>> round(float(hpgr.peak_pressure(dataset, total=True)["peak_pressure"]) / 1e6, 1)  # MPa
+    26.5
     """
     names = ("peak_pressure", "peak_pressure_height")
     return xr.Dataset({name: dataset[name if total else f"streamline_{name}"] for name in names})
@@ -124,6 +140,13 @@ def reduction_ratio(dataset: xr.Dataset, percent: float = 80, total: bool = Fals
     ------
     ValueError
         If the Dataset is of a sweep over the feed, whose scene has one feed only.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> dataset = hpgr.simulate(hpgr.presets.paper().with_values({"material.cushioning": float("inf")}))
+    >>> 25 < float(hpgr.reduction_ratio(dataset, 80, total=True)) < 40
+    True
     """
     swept = [name for name, axis in dataset.coords.items() if axis.attrs.get("scene_field", "").startswith("feed.")]
     if swept:
@@ -138,15 +161,28 @@ def reduction_ratio(dataset: xr.Dataset, percent: float = 80, total: bool = Fals
 
 
 def gap_throughput(scene: Scene, exit_solid_fraction: float) -> float:
-    """Return the solids through the whole gap, Q = rho_s phi_exit s_b L U, kg/s."""
+    """Return the solids through the whole gap, Q = rho_s phi_exit s_b L U, kg/s.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr import metrics
+    >>> round(metrics.gap_throughput(hpgr.presets.paper(), exit_solid_fraction=0.9), 1)  # kg/s
+    854.2
+    """
     rolls = scene.rolls
     surface_speed = rolls.speed * rolls.diameter / 2
     return scene.material.solid_density * exit_solid_fraction * rolls.gap * rolls.width * surface_speed
 
 
-def _require_sizes(dataset: xr.Dataset) -> None:
+def _require_sizes(dataset: xr.Dataset, point: int) -> None:
     if "passing" not in dataset:
         raise ValueError("the Dataset holds no sizes: it is stress only (resolution.cells = 0); simulate it with cells")
+    points = dataset.sizes.get("point")
+    if points is not None and not -points <= point < points:
+        raise ValueError(
+            f"point: got {point}; must be within {-points} to {points - 1}, entry to exit; take -1 for the exit"
+        )
 
 
 def _steady(recorded: xr.DataArray) -> xr.DataArray:
@@ -198,6 +234,15 @@ def between_sieves(found: xr.DataArray, wanted: np.ndarray) -> xr.DataArray:
     ------
     ValueError
         If a size lies outside the recorded sieves.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import xarray as xr
+    >>> from hpgr import metrics
+    >>> found = xr.DataArray([0.2, 0.6], {"sieve": [1e-3, 4e-3]}, "sieve")
+    >>> metrics.between_sieves(found, np.array([2e-3])).values.round(3)
+    array([0.4])
     """
     known = found["sieve"].values
     outside = wanted[(wanted < known[0]) | (wanted > known[-1])]
@@ -224,8 +269,8 @@ def _percentile_between_sieves(found: xr.DataArray, fraction: float, total: bool
             return np.nan
         if not fractions[0] <= fraction <= fractions[-1]:
             raise ValueError(
-                f"percent: got {fraction:.0%}; the recorded sieves pass {fractions[0]:.3%} to {fractions[-1]:.3%}; "
-                "extend resolution.sieves, or record 'cells'"
+                f"percent: got {100 * fraction:g}; must lie within what the recorded sieves pass, "
+                f"{100 * fractions[0]:.3g} to {100 * fractions[-1]:.3g} %; extend resolution.sieves, or record 'cells'"
             )
         first = int(np.searchsorted(fractions, fraction))  # the finest sieve that passes it
         if first == 0 or fractions[first] == fraction:

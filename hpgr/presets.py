@@ -13,6 +13,12 @@ def paper() -> Scene:
 
     The paper gives no roll width, so throughput is per metre of width. Material values are the defaults
     of `hpgr.Material`, whose fields name their sources.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> hpgr.presets.paper()
+    <hpgr.Scene: rolls 6000 mm x 1000 mm, gap 60 mm, 19 rpm; uniform feed to 60 mm; 10 x 200 x 1000>
     """
     return Scene(
         rolls=dict(
@@ -51,6 +57,12 @@ def khd_pilot() -> Scene:
 
     Source: Torres & Casali, "A novel approach for the modelling of high-pressure grinding rolls",
     Minerals Engineering 22 (2009) 1137-1146, and the theses behind it.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> hpgr.presets.khd_pilot()
+    <hpgr.Scene: rolls 800 mm x 250 mm, gap 23.7 mm, 15.9951 rpm; table feed to 45 mm; 10 x 200 x 1000>
     """
     return Scene(
         rolls=dict(
@@ -73,6 +85,12 @@ def industrial() -> Scene:
 
     No plant of its own stands behind it. Sizes and speed lie within usual ranges (model page, Real machines); ore and
     nip as in Torres & Casali 2009 and `khd_pilot`.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> hpgr.presets.industrial().flow.profile
+    'nip'
     """
     return Scene(
         rolls=dict(

@@ -7,6 +7,7 @@ lists every fault at once, each with field, value, bound and remedy.
 
 import difflib
 import itertools
+import json
 import math
 import numbers
 import operator
@@ -82,7 +83,10 @@ def _sieve_rows(value: Any) -> Any:
     if isinstance(value, str | Path):
         try:
             return tables.read_sieve_table(value)
-        except (OSError, ValueError) as error:
+        except OSError as error:
+            reason = f"the file cannot be read ({error.strerror})"
+            raise PydanticCustomError("table", "{reason}", {"reason": reason}) from None
+        except ValueError as error:
             raise PydanticCustomError("table", "{reason}", {"reason": str(error)}) from None
     return value
 
@@ -215,7 +219,7 @@ def _explained(cls: type[_Frozen], error: Any) -> InitErrorDetails:
     extra = (field.json_schema_extra if field else None) or {}
     unit, remedy, value = (
         extra.get("unit", "1"),
-        extra.get("remedy", "see the field's description"),
+        extra.get("remedy") or _remedy(cls, field),
         error["input"],
     )
     plain = isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool) and abs(value) < 1e300)
@@ -234,6 +238,8 @@ def _explained(cls: type[_Frozen], error: Any) -> InitErrorDetails:
         limit = units.parse(value, unit) if isinstance(value, str) and unit != "1" else None
         text = units.show(limit, unit) if limit is not None else text
         bound = f"{words} {units.show(error['ctx'][key], unit)}"
+    elif kind in {"model_type", "model_attributes_type"}:
+        bound = "must be a table of fields"
     elif kind == "finite_number":
         bound = "must be finite"
     elif kind == "literal_error":
@@ -246,8 +252,25 @@ def _explained(cls: type[_Frozen], error: Any) -> InitErrorDetails:
     )
 
 
+def _remedy(cls: type[_Frozen], field: Any) -> str:
+    """Return what to give where no remedy is carried: a field that is a part, a word or a switch, or `cls` itself."""
+    part = _part(field) if field else cls
+    if part is not None:
+        return f"give its fields: {', '.join(part.model_fields)}"
+    words = [repr(word) for word in get_args(field.annotation)]
+    return f"choose one of {', '.join(words)}" if words else "see the field's description"
+
+
 class Rolls(_Frozen):
-    """Two equal counter-rotating rolls and the bed between them (paper section 2.2, figure 1)."""
+    """Two equal counter-rotating rolls and the bed between them (paper section 2.2, figure 1).
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> rolls = hpgr.Rolls(diameter="0.8 m", width="25 cm", gap=0.019, entry_gap="60 mm", speed="16 rpm")
+    >>> round(rolls.speed, 3)  # rad/s
+    1.676
+    """
 
     diameter: Metres = _field(
         "D", "m", "Roll diameter", "machine", "give the roll diameter, such as '0.8 m'", ge=1e-3, le=1e3
@@ -306,7 +329,14 @@ class Rolls(_Frozen):
 
 
 class Material(_Frozen):
-    """Ore: density, strength, fragments and the elasticity of the bed. Defaults: the paper's quartz."""
+    """Ore: density, strength, fragments and the elasticity of the bed. Defaults: the paper's quartz.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> hpgr.Material(strength="2 MPa", cushioning=float("inf")).strength
+    2000000.0
+    """
 
     solid_density: Density = _field(
         "rho_s", "kg m-3", "Density of the grains", "quartz, 2650 kg/m3", "weigh the ore, such as 2700",
@@ -387,6 +417,12 @@ class Feed(_Frozen):
     - "rosin_rammler": passing = 1 - exp(-(s / size)**exponent), renormalised below top_size
     - "table": sieve table, linear in log size; rows (size, percent passing) or the path of a CSV file;
       top_size, if given, scalps the table there
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> hpgr.Feed(kind="table", table=[("1 mm", 10), ("5 mm", 60), ("20 mm", 100)]).coarsest
+    0.02
     """
 
     kind: Literal["uniform", "single", "power_law", "rosin_rammler", "table"] = Field(
@@ -486,7 +522,14 @@ def _table_faults(table: tuple[tuple[float, float], ...], top_size: float | None
 
 
 class Flow(_Frozen):
-    """How the bed moves between the rolls (paper section 2.2; profiles ours)."""
+    """How the bed moves between the rolls (paper section 2.2; profiles ours).
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> round(hpgr.Flow(profile="nip", nip_angle="9 deg").nip_angle, 3)  # rad
+    0.157
+    """
 
     profile: Literal["power", "nip"] = Field(
         "power",
@@ -545,7 +588,14 @@ class RollWidth(_Frozen):
 
 
 class Stress(_Frozen):
-    """How granular elasticity is integrated and which stress crushes (paper eqs. 1 and 4)."""
+    """How granular elasticity is integrated and which stress crushes (paper eqs. 1 and 4).
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> hpgr.Stress(integrator="euler").crushing
+    'mean'
+    """
 
     integrator: Literal["increment", "euler"] = Field(
         "increment",
@@ -561,7 +611,14 @@ class Stress(_Frozen):
 
 
 class Exchange(_Frozen):
-    """Segregation and mixing between neighbouring material points, by swaps of cells (paper eq. 3; closure ours)."""
+    """Segregation and mixing between neighbouring material points, by swaps of cells (paper eq. 3; closure ours).
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> hpgr.presets.paper().with_values({"exchange": hpgr.Exchange(mixing=0)}).exchange.segregation
+    0.1
+    """
 
     segregation: Number = _field(
         "A", "1", "Percolation velocity over shear rate and size difference: large grains rise, small ones sink",
@@ -618,6 +675,12 @@ class Resolution(_Frozen):
     """How finely the scene is computed, and what is kept of it.
 
     `level` names a measured choice of streamlines, points and cells, which are then not given.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> hpgr.Resolution(level="fine").points
+    800
     """
 
     level: Literal["custom", "draft", "standard", "fine"] = Field(
@@ -742,10 +805,28 @@ class Scene(_Frozen):
             If the file cannot be read.
         ValueError
             If it is neither TOML nor JSON, or not a scene (pydantic.ValidationError, every fault listed).
+
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> import hpgr
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "mine.json"
+        ...     _ = path.write_text(hpgr.presets.paper().model_dump_json())
+        ...     hpgr.Scene.from_file(path) == hpgr.presets.paper()
+        True
         """
         path = Path(path)
-        text = path.read_text(encoding="utf-8")
+        try:
+            text = path.read_text(encoding="utf-8")
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{path}: byte {error.start} is not UTF-8; save the scene as text in UTF-8") from None
         if path.suffix == ".json":
+            try:
+                json.loads(text)
+            except json.JSONDecodeError as error:
+                raise ValueError(f"{path}: not JSON: {error}; write it by Scene.model_dump_json()") from None
             return cls.model_validate_json(text)
         try:
             data = tomllib.loads(text)

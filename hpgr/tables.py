@@ -28,9 +28,20 @@ def read_sieve_table(path: str | Path) -> list[tuple[float, float]]:
     ValueError
         If the file cannot be read as such a table, naming the row. Whether the numbers make a
         distribution is the feed's own check.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr import tables
+    >>> rows = tables.read_sieve_table(hpgr.presets.DATA / "khd_porphyry_feed.csv")
+    >>> rows[-1]
+    (0.045, 100.0)
     """
-    with open(path, newline="", encoding="utf-8-sig") as file:
-        lines = [line for line in file if line.strip() and not line.lstrip().startswith("#")]
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            lines = [line for line in file if line.strip() and not line.lstrip().startswith("#")]
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: byte {error.start} is not UTF-8; save the table as CSV in UTF-8") from None
     if not lines:
         raise ValueError(f"{path}: the table is empty; give a header and rows of size, percent passing")
     header, *rows = csv.reader(lines)
@@ -57,7 +68,9 @@ def _numbers(row: list[str], number: int, path) -> tuple[float, float]:
     try:
         size, percent = map(float, row)
     except ValueError:
-        raise ValueError(f"{path}: row {number} {','.join(row)!r} is not two numbers (size, percent passing)") from None
+        raise ValueError(
+            f"{path}: row {number} {','.join(row)!r} is not two numbers (size, percent passing); correct or remove it"
+        ) from None
     return size, percent
 
 
@@ -153,10 +166,13 @@ def read_pilot_tests(product: str | Path, operations: str | Path) -> tuple[Pilot
         If the tables are not such tests: one error that lists every fault with file, line, column, value,
         bound and remedy.
 
-    Example
-    -------
-    >>> [first, *_] = read_pilot_tests("psd.csv", "operations.csv")  # doctest: +SKIP
-    >>> first.name, first.surface_speed, first.total[-1]  # doctest: +SKIP
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr import tables
+    >>> folder = hpgr.presets.DATA
+    >>> [first, *_] = tables.read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
+    >>> first.name, first.surface_speed, float(first.total[-1])
     ('K-P1', 0.67, 1.0)
     """
     faults: list[str] = []

@@ -103,7 +103,7 @@ class _Purse:
             grid = scene.resolution
             raise ValueError(
                 f"tolerance: got {self._tolerance:g}; needs at least {grid.streamlines} streamlines x {grid.points} "
-                f"points x {grid.cells} cells, predicted to cost {self.seconds + seconds:,.1f} s, must be at most "
+                f"points x {grid.cells} cells, predicted to cost {self.seconds + seconds:,.3g} s; must be at most "
                 f"max_cost = {self._max_cost:g} s; raise max_cost or the tolerance"
             )
         self.seconds += seconds

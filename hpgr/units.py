@@ -30,6 +30,7 @@ _EXAMPLES = {
 # stricter than pint, which reads past what it does not understand ("60; mm") and sums up ("60 mm + 1 m")
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|[+-]?(?:nan|inf)(?=\s)"
 _QUANTITY = re.compile(rf"\s*({_NUMBER})\s*([a-zµμ][\w*/^.-]*)?\s*", re.IGNORECASE)
+_FAULTS = {"UndefinedUnitError": "is not known", "DimensionalityError": "measures something else"}  # pint's names
 _ANGLE = re.compile("rpm|rad|deg|rev|turn")  # pint takes 1 Hz for 1 rad/s
 
 
@@ -62,7 +63,8 @@ def parse(text: str, unit: str) -> float:
     try:
         return float((number * _registry().Unit(named)).to(_PINT[unit]).magnitude)
     except (PintError, ArithmeticError, AttributeError, TypeError, ValueError, AssertionError) as error:
-        raise ValueError(f"not a quantity in {shown} ({type(error).__name__})") from None
+        fault = _FAULTS.get(type(error).__name__, "does not make a number")
+        raise ValueError(f"not a quantity in {shown}: its unit {named!r} {fault}") from None
 
 
 def show(value: float, unit: str) -> str:

@@ -104,6 +104,7 @@ def page_of(data: dict[str, Any], library: str) -> str:
 
     Examples
     --------
+    >>> from studies.explore import page_of
     >>> "<title>a &lt; b" in page_of({"name": "a < b"}, "")
     True
     """
@@ -125,6 +126,7 @@ def embedded(data: dict[str, Any]) -> str:
 
     Examples
     --------
+    >>> from studies.explore import embedded
     >>> embedded({"note": "</script>"})
     '{"note":"\\u003c/script\\u003e"}'
     """

@@ -47,6 +47,7 @@ def page_data(result: xr.Dataset, sieve: float, name: str) -> dict[str, Any]:
     Examples
     --------
     >>> import hpgr
+    >>> from studies.explore_data import page_data
     >>> from studies.sweep import sweep
     >>> base = hpgr.presets.paper().with_values({"resolution.cells": 100, "resolution.points": 50})
     >>> data = page_data(sweep(base, {"rolls.gap": ["40 mm", "60 mm"]}), 0.001, "two gaps")
@@ -142,6 +143,8 @@ def numbers(values: np.ndarray, digits: int = DIGITS) -> list:
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from studies.explore_data import numbers
     >>> numbers(np.array([0.123456789, 3.0, np.nan]))
     [0.123457, 3, None]
     """
@@ -209,7 +212,7 @@ def with_sieve(result: xr.Dataset, sieve: float, coarsest: float) -> xr.Dataset:
     if not known[0] <= sieve <= known[-1]:
         raise ValueError(
             f"--sieve: got {units.show(sieve, 'm')}; must lie within the recorded sieves, "
-            f"{units.show(known[0], 'm')} to {units.show(known[-1], 'm')}"
+            f"{units.show(known[0], 'm')} to {units.show(known[-1], 'm')}; choose one within"
         )
     across = [name for name in kept["passing_total"].dims if name != "sieve"]
     first = max(int(np.argmax(kept["passing_total"].max(across).values > 0)) - 1, 0)

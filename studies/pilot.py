@@ -72,7 +72,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from studies import store
 
     store.probe(options.out)
-    tests = read_pilot_tests(options.tests, options.operations)
+    try:
+        tests = read_pilot_tests(options.tests, options.operations)
+    except OSError as error:
+        raise OSError(
+            f"cannot read {error.filename}: {error.strerror}; give --tests and --operations the paths of CSV files"
+        ) from None
     known = _chosen(options.calibrate_on, tests)
     scene, fit = starting_scene(options, known)
     models = _models(scene, known, fit, options.baselines)
@@ -98,8 +103,8 @@ def _chosen(names: Sequence[str] | None, tests: Sequence[Any]) -> list[Any]:
     unknown = [name for name in wanted or () if name not in known]
     if unknown or not wanted:
         raise ValueError(
-            f"--calibrate-on: got {unknown[0] if unknown else 'nothing'}; must be of {', '.join(known)}; name tests to "
-            "fit to, best two of different force"
+            f"--calibrate-on: got {unknown[0] if unknown else 'nothing'}; must be among {', '.join(known)}; name tests "
+            "to fit to, best two of different force"
         )
     return [known[name] for name in dict.fromkeys(wanted)]
 

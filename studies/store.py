@@ -62,6 +62,20 @@ def write_dataset(dataset: xr.Dataset, path: str | Path) -> None:
     ------
     OSError
         If it cannot be written; a file that stood at `path` before is left as it was.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import xarray as xr
+    >>> import hpgr
+    >>> from studies.store import write_dataset
+    >>> dataset = hpgr.simulate(hpgr.presets.paper().with_values({"resolution.cells": 0}))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_dataset(dataset, Path(folder) / "stresses.nc")
+    ...     with xr.open_dataset(Path(folder) / "stresses.nc") as read:
+    ...         read["pressure"].dims
+    ('streamline', 'point')
     """
     if "time" in dataset.dims:
         dataset = dataset.rename(time="photograph")
@@ -85,6 +99,19 @@ def open_result(path: str | Path) -> xr.Dataset:
         If it would have the library read other files or load filters, or is no NetCDF file.
     OSError
         If it cannot be read.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import hpgr
+    >>> from studies.store import open_result, write_dataset
+    >>> small = hpgr.presets.paper().with_values({"resolution.cells": 50, "resolution.points": 40})
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_dataset(hpgr.simulate(small), Path(folder) / "one.nc")
+    ...     with open_result(Path(folder) / "one.nc") as dataset:
+    ...         dataset["p80"].dims
+    ('streamline',)
     """
     refuse_foreign_storage(path)
     with _LIBRARY:

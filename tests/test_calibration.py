@@ -127,7 +127,7 @@ def test_tables_without_what_was_not_measured_will_do(tmp_path):
     assert list(found.residuals["mine"]) == ["total"]
     assert np.abs(found.residuals["mine"]["total"]).max() < 20
     assert found.scene.rolls.specific_pressing_force == 2.5e6
-    with pytest.raises(ValueError, match="fit: got K, which are fitted to throughput, power and cake thickness; must"):
+    with pytest.raises(ValueError, match="fit: got K, fitted to throughput, power and cake thickness; must"):
         hpgr.calibrate(start(), None, product, operations, fit=["sigma_m", "K"])
     other = hpgr.Feed(kind="single", size="30 mm")
     assert hpgr.calibrate(start(), other, product, operations, fit=["sigma_m", "gamma"]).scene.feed == other
@@ -146,12 +146,16 @@ def test_report_is_short_and_has_units(pilot_tests):
 @pytest.mark.parametrize(
     ("fit", "values", "words"),
     [
-        (["sigma"], {}, "fit: got sigma; must be of sigma_m, w, gamma, n, K, alpha, kappa, T_0; name some"),
+        (
+            ["sigma"],
+            {},
+            "fit: got sigma; must be among sigma_m, w, gamma, n, K, alpha, kappa, T_0; correct the symbols",
+        ),
         ([], {}, "fit: got nothing"),
         (["kappa"], {}, "fit: got kappa; must be fitted with a roll_width"),
         (["alpha"], {"flow": {}}, "fit: got alpha; must be fitted with flow.profile = 'nip'"),
         (["sigma_m"], {"material.bulk_modulus": 1e5, "material.shear_modulus": 5e4}, "scene: no gap carries the force"),
-        (["K", "alpha", "T_0", "sigma_m"], {}, "fit: got K, alpha, T_0, which are fitted to"),
+        (["K", "alpha", "T_0", "sigma_m"], {}, "fit: got K, alpha, T_0, fitted to"),
     ],
 )
 def test_what_cannot_be_fitted_is_refused(pilot_tests, fit, values, words):
@@ -163,7 +167,7 @@ def test_what_cannot_be_fitted_is_refused(pilot_tests, fit, values, words):
 
 
 def test_unknown_tests_are_refused():
-    with pytest.raises(ValueError, match="tests: got 'K-P9'; must be of K-P1, K-P2, K-P3, K-P4, K-P5; correct"):
+    with pytest.raises(ValueError, match="tests: got 'K-P9'; must be among K-P1, K-P2, K-P3, K-P4, K-P5; correct"):
         hpgr.calibrate(start(), None, PSD, OPERATIONS, tests=["K-P1", "K-P9"])
 
 
@@ -182,3 +186,10 @@ def test_bounds_and_scales_go_there_and_back():
         for value in (parameter.low, PLANTED.get(name, 1.0), parameter.high):
             assert parameter.value(parameter.scaled(value)) == pytest.approx(value, rel=1e-12, abs=1e-12)
     assert calibration.PARAMETERS["K"].follower == "material.shear_modulus"
+
+
+def test_no_tests_and_no_product_to_fit_to_are_refused(pilot_tests):
+    with pytest.raises(ValueError, match="tests: got none; must be among K-P1"):
+        hpgr.calibrate(start(), None, PSD, OPERATIONS, tests=[])
+    with pytest.raises(ValueError, match=r"0 values of these; resolution\.cells = 0 has no product"):
+        fit_tests(start(values={"resolution.cells": 0}), [pilot_tests["K-P1"]], ["gamma"])

@@ -413,7 +413,7 @@ def test_unknown_options_are_refused(folder, capsys, arguments):
     ("name", "content", "words"),
     [
         ("bad.toml", "[rolls\n", ["bad.toml", "not TOML", "line 1"]),
-        ("bad.json", "{", ["scene is refused", "JSON"]),
+        ("bad.json", "{", ["bad.json", "not JSON", "line 1"]),
         ("empty.toml", "", ["rolls", "feed", "required"]),
         (
             "faulty.toml",

@@ -127,7 +127,9 @@ def test_what_was_not_recorded_is_refused_with_the_remedy(product):
     with pytest.raises(ValueError, match=r"sieves: got 2 m; must lie within the recorded 1e-06 to 1 m"):
         passing(product, [0.001, 2.0])
     coarse = run("product", {"resolution.sieves": (0.001, 0.002)})
-    with pytest.raises(ValueError, match=r"percent: got 1%; the recorded sieves pass .* extend resolution.sieves"):
+    with pytest.raises(
+        ValueError, match=r"percent: got 1; must lie within what the recorded .* extend resolution.sieves"
+    ):
         percentile_size(coarse, 1)
 
 
@@ -206,3 +208,13 @@ def test_extra_dims_are_kept_with_recorded_cells_too():
     swept = xr.concat([run("cells"), run("cells", {"rolls.gap": 0.05})], xr.Variable("gap", [0.06, 0.05]))
     assert set(passing(swept, [0.001]).dims) == {"gap", "streamline", "sieve"}
     assert set(percentile_size(swept, 65).dims) == {"gap", "streamline"}
+
+
+@pytest.mark.parametrize("point", [41, -42, 1000])
+def test_points_beyond_the_bed_are_refused(point):
+    ds = simulate(paper({"resolution.points": 41}))
+    with pytest.raises(ValueError, match=rf"point: got {point}; must be within -41 to 40"):
+        passing(ds, point=point)
+    with pytest.raises(ValueError, match="point: got"):
+        percentile_size(ds, 80, point=point)
+    assert passing(ds, point=-41).identical(passing(ds, point=0))

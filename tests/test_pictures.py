@@ -85,7 +85,7 @@ def test_only_what_is_asked_for(regenerate, monkeypatch):
 
 def test_unknown_pictures_and_failed_studies(regenerate, monkeypatch, capsys):
     assert regenerate.main(["nothing.png"]) == 2
-    assert "got nothing.png; must be of gap_sweep.png" in capsys.readouterr().err
+    assert "got nothing.png; must be among gap_sweep.png" in capsys.readouterr().err
     monkeypatch.setattr(regenerate, "PICTURES", {"first.png": (lambda _: 2, "a.nc")})
     assert regenerate.main([]) == 1
     assert not list(regenerate.DOCS.iterdir())

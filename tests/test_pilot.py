@@ -117,7 +117,7 @@ def test_force_that_no_gap_carries_loses_its_test_only(written, folder, capsys):
     ("arguments", "words"),
     [
         (["--calibrate-on", "K-P9"], ["--calibrate-on", "K-P9", "K-P1, K-P2"]),
-        (["--tests", "none.csv"], ["none.csv"]),
+        (["--tests", "none.csv"], ["cannot read none.csv: No such file", "--tests"]),
         (["--cells", "0"], ["--cells", "at least 1"]),
         (["--fit", "sigma"], ["fit", "sigma", "sigma_m"]),
         (["--out", "."], ["folder"]),

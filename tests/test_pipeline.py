@@ -495,4 +495,5 @@ def test_public_names_load_on_first_use():
 
 @pytest.mark.parametrize("name", sorted(module.name for module in pkgutil.walk_packages(hpgr.__path__, "hpgr.")))
 def test_examples_in_docstrings(name):
-    assert doctest.testmod(importlib.import_module(name)).failed == 0
+    """They bring their own imports, so that a reader can paste them."""
+    assert doctest.testmod(importlib.import_module(name), globs={}).failed == 0

@@ -30,7 +30,7 @@ def blocks(language):
 
 @pytest.mark.parametrize("name", MODULES)
 def test_examples_in_docstrings(name):
-    assert doctest.testmod(importlib.import_module(name)).failed == 0
+    assert doctest.testmod(importlib.import_module(name), globs={}).failed == 0
 
 
 def test_there_are_examples():

@@ -1,5 +1,6 @@
 import json
 import math
+import re
 from typing import get_args
 
 import numpy as np
@@ -604,3 +605,37 @@ def test_feed_says_its_coarsest_size():
     assert Feed(kind="single", size=0.01).coarsest == 0.01
     assert Feed(kind="table", table=((0.001, 0.0), (0.03, 100.0))).coarsest == 0.03
     assert Feed(kind="rosin_rammler", size=0.01, exponent=1, top_size=0.05).coarsest == 0.05
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"rolls.gap": "60 kg"}, "got '60 kg'; not a quantity in mm: its unit 'kg' measures something else; measure"),
+        ({"rolls.gap": "60 foos"}, "its unit 'foos' is not known"),
+        ({"rolls": 3}, "got 3; must be a table of fields; give its fields: diameter, width, gap"),
+        ({"feed": {}}, "got nothing; it is required; choose one of 'uniform', 'single'"),
+        ({"feed": {"kind": "table", "table": "no.csv"}}, r"got 'no.csv'; the file cannot be read \(No such file"),
+    ],
+)
+def test_messages_say_what_to_give(values, words):
+    with pytest.raises(ValidationError, match=words) as refused:
+        presets.paper().with_values(values)
+    assert not re.search(r"Error|Errno|see the field", str(refused.value).split("for Scene")[1])
+
+
+def test_missing_parts_are_named_with_their_fields():
+    with pytest.raises(ValidationError, match="it is required; give its fields: kind, bottom_size"):
+        Scene(rolls=presets.paper().rolls)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.json", b"{", r"a\.json: not JSON: .* line 1"),
+        ("a.toml", b"note = '\xe9'", r"a\.toml: byte 8 is not UTF-8; save"),
+    ],
+)
+def test_files_that_are_no_text_name_themselves(tmp_path, name, content, words):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=words):
+        Scene.from_file(tmp_path / name)

@@ -234,3 +234,9 @@ def test_a_table_in_another_encoding_is_refused(tmp_path):
 def test_missing_pilot_table_is_an_os_error(tmp_path):
     with pytest.raises(OSError, match=r"none\.csv"):
         tables.read_pilot_tests(tmp_path / "none.csv", write(tmp_path / "o.csv", OPERATIONS))
+
+
+def test_a_sieve_table_that_is_no_utf8_is_refused(tmp_path):
+    (tmp_path / "a.csv").write_bytes(b"size_\xe9,percent_passing\n1,2\n")
+    with pytest.raises(ValueError, match=r"a\.csv: byte 5 is not UTF-8; save the table"):
+        tables.read_sieve_table(tmp_path / "a.csv")

@@ -106,7 +106,7 @@ def test_wanted_cells_of_a_scene_without_cushioning_are_judged_as_cells():
 
 def test_impossible_tolerance_is_refused_with_its_cost():
     scene = hpgr.presets.paper().with_values({"resolution.record": "product"})
-    with pytest.raises(ValueError, match=r"tolerance: got 0\.001; .*predicted to cost .* s, must be at most max_cost"):
+    with pytest.raises(ValueError, match=r"tolerance: got 0\.001; .*predicted to cost .* s; must be at most max_cost"):
         hpgr.simulate(scene, tolerance=0.001, max_cost=0.05)
 
 

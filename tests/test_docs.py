@@ -1,0 +1,203 @@
+"""The documents: Python runs and prints what it says, command lines are taken, and the API page is up to date.
+
+The README's own code, and the examples in docstrings, run in tests/test_ready.py and tests/test_pipeline.py.
+"""
+
+import dataclasses
+import importlib
+import importlib.util
+import inspect
+import io
+import re
+import shlex
+from contextlib import redirect_stdout
+from pathlib import Path
+
+import matplotlib
+import pytest
+import tyro
+from support import SCENE_TOML
+
+import hpgr
+import studies
+from hpgr import schema
+from hpgr.scene import Scene
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
+RUN = [page for page in PAGES if page.name == "tutorial.md" or page.name.startswith("howto_")]
+ARROW = "# ->"
+NEAR = 0.02  # relative, of printed numbers
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d+\.?\d*(?:e[-+]?\d+)?(?![\w])")
+
+
+def text_of(page):
+    return page.read_text(encoding="utf-8")
+
+
+def blocks(page, language):
+    return re.findall(rf"^```{language}\n(.*?)^```", text_of(page), re.MULTILINE | re.DOTALL)
+
+
+def expected(block):
+    """Return the lines that a block says it prints."""
+    return [line[len(ARROW) + 1 :] for line in block.splitlines() if line.startswith(ARROW)]
+
+
+def assert_near(printed, told, where):
+    """Assert that lines agree word by word, numbers within NEAR."""
+    assert len(printed) == len(told), (where, printed, told)
+    for one, other in zip(printed, told, strict=True):
+        assert re.sub(r"\s+", "", NUMBER.sub("#", one)) == re.sub(r"\s+", "", NUMBER.sub("#", other)), (where, one)
+        for found, said in zip(NUMBER.findall(one), NUMBER.findall(other), strict=True):
+            assert float(found) == pytest.approx(float(said), rel=NEAR), (where, one, other)
+
+
+def run(page):
+    """Run the blocks of a page in one namespace."""
+    namespace = {"__name__": "page"}
+    for number, block in enumerate(blocks(page, "python"), start=1):
+        where = f"{page.name}, block {number}"
+        printed = io.StringIO()
+        with redirect_stdout(printed):
+            exec(compile(block, where, "exec"), namespace)
+        if expected(block):
+            assert_near(printed.getvalue().splitlines(), expected(block), where)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Run in an empty folder, drawing to files."""
+    monkeypatch.chdir(tmp_path)
+    shown = matplotlib.get_backend()
+    matplotlib.use("Agg")
+    yield tmp_path
+    import matplotlib.pyplot as plt
+
+    plt.close("all")
+    matplotlib.use(shown)
+
+
+@pytest.mark.parametrize("page", RUN, ids=lambda page: page.name)
+def test_pages_run(page, folder, capfd):
+    run(page)
+
+
+def test_tutorial_says_what_it_prints():
+    assert sum(len(expected(block)) for block in blocks(DOCS / "tutorial.md", "python")) >= 25
+
+
+@pytest.mark.parametrize(
+    ("printed", "told"), [("1.00", "1.03"), ("12 of 12", "12 of 13"), ("a 1", "b 1"), ("-1.0", "1.0"), ("[1 2]", "[1]")]
+)
+def test_what_is_printed_must_be_near(printed, told):
+    assert_near([told], [told], "itself")
+    with pytest.raises((AssertionError, ValueError)):
+        assert_near([printed], [told], "another")
+
+
+def code(page):
+    """Return the lines of fenced and indented blocks, and the code within the text, its line breaks undone."""
+    fenced = re.findall(r"^```.*?\n(.*?)^```", text_of(page), re.MULTILINE | re.DOTALL)
+    prose = re.sub(r"^```.*?^```", "", text_of(page), flags=re.MULTILINE | re.DOTALL)
+    inline = [" ".join(one.split()) for one in re.findall(r"`([^`]+)`", prose)]
+    return "".join(fenced).splitlines(), re.findall(r"^    (\S.*)", prose, re.MULTILINE), inline
+
+
+def commands(page):
+    """Return (study, arguments) of every command line on a page; a study named without any is none."""
+    found = [re.findall(r"python -m studies\.(\w+)([^&|]*)", line) for part in code(page) for line in part]
+    split = [(study, shlex.split(rest, comments=True)) for line in found for study, rest in line]
+    return [(study, arguments) for study, arguments in split if arguments]
+
+
+class Parsed(BaseException):
+    """Raised where a study has taken its arguments, so that it stops there."""
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_studies_take_the_commands(page, folder, monkeypatch, capsys):
+    taken = tyro.cli
+
+    def stop(*arguments, **options):
+        taken(*arguments, **options)
+        raise Parsed
+
+    monkeypatch.setattr(tyro, "cli", stop)
+    Path("mine.toml").write_text(SCENE_TOML)
+    for study, arguments in commands(page):
+        with pytest.raises((Parsed, SystemExit)) as ended:
+            importlib.import_module(f"studies.{study}").main(arguments)
+        helped = "--help" in arguments and getattr(ended.value, "code", 1) == 0
+        assert helped or ended.type is Parsed, (study, arguments, capsys.readouterr())
+
+
+def test_there_are_commands_to_take():
+    assert sum(len(commands(page)) for page in PAGES) >= 20
+    assert all(commands(page) for page in PAGES if page.name in ("README.md", "tutorial.md", "howto_calibrate.md"))
+
+
+def test_options_named_in_the_text_are_known():
+    known = {"--help", "--nthreads"}  # the latter of dask
+    for path in (ROOT / "studies").glob("*.py"):
+        options = getattr(importlib.import_module(f"studies.{path.stem}"), "Options", None)
+        for field in dataclasses.fields(options) if options else ():
+            known |= {f"--{no}{field.name.replace('_', '-')}" for no in ("", "no-")}
+    for page in PAGES:
+        ours = [one for one in code(page)[-1] if one.startswith(("--", "python -m studies."))]  # or other programs'
+        named = {name for one in ours for name in re.findall(r"(?<![\w-])--[a-z-]+", one)}
+        assert named <= known, (page.name, named - known)
+
+
+def test_studies_named_are_there():
+    for page in PAGES:
+        for study in re.findall(r"studies\.([a-z]\w*)", text_of(page)):
+            assert hasattr(studies, study) or importlib.util.find_spec(f"studies.{study}"), (page.name, study)
+
+
+def test_links_lead_somewhere():
+    for page in PAGES:
+        for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text_of(page)):
+            if not target.startswith("http"):
+                assert (page.parent / target).exists(), (page.name, target)
+
+
+@pytest.fixture(scope="module")
+def api():
+    spec = importlib.util.spec_from_file_location("api", DOCS / "api.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_api_page_is_up_to_date(api):
+    assert text_of(api.PAGE) == api.page(), "run: python docs/api.py"
+
+
+def test_api_page_has_every_field_variable_and_flag(api):
+    page = text_of(api.PAGE)
+    for name, part in Scene.model_fields.items():
+        known = getattr(part.annotation, "model_fields", None) or {}
+        assert all(f"| `{name}.{key}` |" in page for key in known)
+    assert "| `rolls.gap` | `s_b` | m | required | ≥ 1e-06, ≤ 1000 | Gap where the rolls are closest |" in page
+    assert "| `material.strength` | `sigma_m` | Pa | 0.84 MPa | ≥ 1, ≤ 1e+15 |" in page
+    for name in (*schema.VARIABLES, *schema.COORDINATES, *schema.FLAGS):
+        assert f"| `{name}` |" in page
+    assert all(f"### `{name}" in page for name in hpgr.__all__)
+
+
+def needs_example(name, thing):
+    """Public functions need one, and the classes of the public face; what functions return does not."""
+    return inspect.isfunction(thing) or name.count(".") == 1
+
+
+def test_every_public_function_has_an_example(api):
+    public = dict(api.listed())
+    public |= {"hpgr.Scene.from_file": Scene.from_file, "hpgr.Scene.with_values": Scene.with_values}
+    wanted = {name: thing for name, thing in public.items() if needs_example(name, thing)}
+    assert len(wanted) > 50
+    missing = [name for name, thing in wanted.items() if ">>> " not in (inspect.getdoc(thing) or "")]
+    assert not missing, "give these an Examples section"
+    skipped = [name for name, thing in wanted.items() if "+SKIP" in inspect.getdoc(thing)]
+    assert not skipped, "these examples do not run"
