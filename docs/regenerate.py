@@ -11,9 +11,10 @@ from pathlib import Path
 
 from PIL import Image
 
-from studies import accuracy, gap_sweep, paper, pilot, store
+from studies import accuracy, extremes, gap_sweep, paper, pilot, store
 
 DOCS = Path(__file__).parent
+BY_HAND = ("explore.png",)  # a screenshot of a browser
 LARGEST = 250_000  # bytes of a PNG that stays in all its colours
 
 # picture: (the study that draws it, the option --out of the study, relative to a folder)
@@ -21,6 +22,8 @@ PICTURES: dict[str, tuple[Callable[[Sequence[str]], int], str]] = {
     "gap_sweep.png": (gap_sweep.main, "gap_sweep.nc"),
     "accuracy.png": (accuracy.main, "accuracy.nc"),
     "pilot.png": (pilot.main, "pilot.nc"),
+    "extremes.png": (extremes.main, "extremes.nc"),
+    "extremes_euler.png": (extremes.main, "extremes.nc"),
     **{name: (paper.main, "") for name in (*paper.FIGURES, paper.ANIMATION)},
 }
 

@@ -558,12 +558,12 @@ class Flow(_Frozen):
         given = [name for name in ("nip_angle", "cake_solid_fraction") if known.get(name) is not None]
         if known.get("profile") == "power":
             for name in given:
-                yield Fault(
-                    name, f"{known[name]:g}", "profile 'power' has no nip", "leave it out, or take profile 'nip'"
-                )
+                yield Fault(name, f"{known[name]:g}", "must not be given with profile 'power', which has no nip",
+                            "leave it out, or take profile 'nip'")  # fmt: skip
         if known.get("profile") == "nip" and len(given) != 1 and {"nip_angle", "cake_solid_fraction"} <= known.keys():
-            yield Fault("nip_angle", " and ".join(given) or "nothing", "profile 'nip' needs either nip_angle or "
-                        "cake_solid_fraction", "give one of them, such as cake_solid_fraction = 0.85")  # fmt: skip
+            yield Fault("nip_angle", " and ".join(given) or "nothing",
+                        "must be one of nip_angle and cake_solid_fraction with profile 'nip'",
+                        "give one of them, such as cake_solid_fraction = 0.85")  # fmt: skip
 
 
 class RollWidth(_Frozen):
@@ -579,7 +579,7 @@ class RollWidth(_Frozen):
     )  # fmt: skip
     edge_share: Number = _field(
         "e", "1", "Part of the roll width whose product is called edge product", "Torres & Casali 2009",
-        "give a fraction such as 0.2", 0.2, gt=0, lt=1,
+        "give a fraction such as 0.2", 0.2, ge=1e-3, le=0.999,
     )  # fmt: skip
     slices: Count = _field(
         "N_z", "1", "Slices of the centre, and as many of the edge, that are crushed apart", "ours",
@@ -780,11 +780,12 @@ class Scene(_Frozen):
                             "crush or scalp the feed first, or begin the bed higher")  # fmt: skip
         yield from _nip_faults(known)
         if known.get("roll_width.slices") and known.get("exchange.interval"):
-            yield Fault("roll_width", "slices", "exchange between streamlines is not simulated slice by slice",
+            yield Fault("roll_width", "slices",
+                        "must not be given beside exchange, which is not simulated slice by slice",
                         "leave roll_width or exchange out")  # fmt: skip
         whole = known.get("resolution.record", "product") != "product" and known.get("resolution.cells") != 0
         if known.get("roll_width.slices") and whole:
-            yield Fault("resolution.record", repr(known["resolution.record"]), "roll_width keeps the product only",
+            yield Fault("resolution.record", repr(known["resolution.record"]), "must be 'product' with a roll_width",
                         "take record = 'product', or leave roll_width out")  # fmt: skip
         table, top_size = known.get("feed.table"), known.get("feed.top_size")
         coarsest = next((size for size, percent in table or () if percent >= 100), 0.0)
@@ -896,7 +897,7 @@ def _nip_faults(known: dict[str, Any]) -> Iterator[Fault]:
         if room < 0:
             densest = feed * (gap + diameter) ** 2 / (4 * gap * diameter)
             yield Fault("flow.cake_solid_fraction", f"{cake:g}",
-                        f"no nip angle feeds so dense a cake; must be at most {densest:.3g}",
+                        f"must be at most {densest:.3g}, beyond which no nip angle feeds the cake",
                         "give a lighter cake or a narrower gap")  # fmt: skip
             return
         angle = math.acos(min((gap + diameter + math.sqrt(room)) / (2 * diameter), 1.0))

@@ -170,7 +170,24 @@ def draw(base: Scene, generator: np.random.Generator, exchange: bool, most_secon
     drawn |= zip(fractions, sorted(fractions.values()), strict=True)
     drawn |= _draw_feed(drawn.get("rolls.entry_gap", base.rolls.entry_gap), generator)
     drawn |= _draw_resolution(exchange, generator)
+    _reconcile(drawn, exchange, generator)
     return _affordable(base, drawn, most_seconds)
+
+
+def _reconcile(drawn: dict[str, Any], exchange: bool, generator: np.random.Generator) -> None:
+    """Take out what excludes each other: two nips or none, slices of the roll width with exchange or whole records."""
+    nips = ["flow.nip_angle", "flow.cake_solid_fraction"]
+    for name in nips:
+        drawn.pop(name, None)
+    if drawn.get("flow.profile") == "nip":
+        name = nips[generator.integers(2)]
+        drawn[name] = numeric_fields()[name].at(generator.random())
+    width = [name for name in drawn if name.startswith("roll_width.")]
+    if exchange or generator.random() < 0.5:
+        for name in width:
+            del drawn[name]
+    elif width:
+        drawn["resolution.record"] = "product"
 
 
 def _draw_number(known: Range, generator: np.random.Generator) -> float:

@@ -158,8 +158,8 @@ def test_every_scalar_of_a_sweep_is_a_figure():
     )
     lose(result, "boom", gap=0, replicate=0)
     kpis = {one["heading"]: one for one in explore_data.page_data(result, 1e-3, "x")["kpis"]}
-    agree(kpis["power [W]"], flat(result, "power"))
-    assert kpis["power [W]"]["about"] == "power of both rolls"
+    agree(kpis["power [kW]"], flat(result, "power") / 1e3)
+    assert kpis["power [kW]"]["about"] == "power of both rolls"
     assert kpis["passes"]["mean"] == [2, 4]  # of the replicate that is left: an integer has no NaN of its own
     assert kpis["passes"]["sd"] == [None, 0]
     assert not {"status", "flags"} & {one["heading"] for one in kpis.values()}

@@ -325,8 +325,8 @@ AXES_KILLED = {"rolls.gap": [0.04, 0.045, 0.05, 0.055, 0.06], "feed.top_size": [
 
 @pytest.mark.parametrize("record", ["product", "distributions"])
 def test_driver_killed_at_random_moments(tmp_path, record):
-    """SIGKILL, again and again; HPGR_KILLS sets how often (default 50 for each kind of record)."""
-    kills = os.environ.get("HPGR_KILLS", str(sized(50, 3)))
+    """SIGKILL, again and again; HPGR_KILLS sets how often (default 12 for each kind of record)."""
+    kills = os.environ.get("HPGR_KILLS", str(sized(12, 3)))
     script = _KILLED.format(tests=str(Path(__file__).parent), small=SMALL)
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", script, kills, record, str(tmp_path)], capture_output=True, text=True,

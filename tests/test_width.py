@@ -135,9 +135,12 @@ def test_same_bits_with_and_without_other_slices_of_the_same_place():
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        ({"exchange": {}}, "exchange between streamlines is not simulated slice by slice; leave roll_width or"),
-        ({"resolution.record": "cells"}, "roll_width keeps the product only; take record = 'product'"),
-        ({"resolution.record": "distributions"}, "roll_width keeps the product only"),
+        (
+            {"exchange": {}},
+            "must not be given beside exchange, which is not simulated slice by slice",
+        ),
+        ({"resolution.record": "cells"}, "must be 'product' with a roll_width; take record = 'product'"),
+        ({"resolution.record": "distributions"}, "must be 'product' with a roll_width"),
         ({"roll_width": {"pressure_drop": 1.1}}, "must be at most 1"),
         ({"roll_width": {"edge_share": 0.0}}, "must be greater than 0"),
         ({"roll_width": {"slices": 0}}, "must be at least 1"),
