@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from hpgr import flow, geometry, stress, units, width
 from hpgr.flow import Motion
 from hpgr.geometry import Geometry
-from hpgr.scene import Scene
+from hpgr.scene import LEAST_GAP, Scene
 from hpgr.stress import Load
 
 # Usual machines and operation (design figures of makers, as collected in the mission of this package; phi ours)
@@ -282,11 +282,13 @@ def at_operating_gap(scene: Scene) -> Scene:
 def _gap_range(scene: Scene, angle: float | None) -> tuple[float, float]:
     """Return the narrowest and the widest gap that can be: solid rock at the exit, and the nip at the bed's top."""
     rolls, feed = scene.rolls, scene.material.feed_solid_fraction
+    least = max(_NARROWEST * rolls.diameter, LEAST_GAP)
     if angle is None:
         steepest = rolls.entry_gap - 0.4999 * rolls.diameter  # what a scene allows, see hpgr.scene.Rolls
-        return max(_NARROWEST * rolls.diameter, steepest), rolls.entry_gap * (1 - 1e-9)
+        return max(least, steepest), rolls.entry_gap * (1 - 1e-9)
     rise, kept = rolls.diameter * (1 - math.cos(angle)), feed * math.cos(angle)
-    return max(kept * rise / (1 - kept), _NARROWEST * rolls.diameter), rolls.entry_gap - rise
+    solid = kept * rise / (1 - kept) if kept < 1 else math.inf
+    return max(least, solid), rolls.entry_gap - rise
 
 
 def _why_no_narrower(scene: Scene) -> str:

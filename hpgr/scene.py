@@ -31,6 +31,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from hpgr import tables, units
 
 # The largest entry angle the cubic streamlines allow: above it their half width no longer grows with height.
+LEAST_GAP = 1e-6  # m
 _STEEPEST_ENTRY = 0.5  # (entry gap - gap) / diameter, reached at an entry angle of 60 degrees
 
 
@@ -290,7 +291,7 @@ class Rolls(_Frozen):
         "Gap where the rolls are closest",
         "machine",
         "measure the working gap, such as '20 mm'",
-        ge=1e-6,
+        ge=LEAST_GAP,
         le=1e3,
     )
     entry_gap: Metres = _field(

@@ -142,7 +142,7 @@ def test_same_bits_with_and_without_other_slices_of_the_same_place():
         ({"resolution.record": "cells"}, "must be 'product' with a roll_width; take record = 'product'"),
         ({"resolution.record": "distributions"}, "must be 'product' with a roll_width"),
         ({"roll_width": {"pressure_drop": 1.1}}, "must be at most 1"),
-        ({"roll_width": {"edge_share": 0.0}}, "must be greater than 0"),
+        ({"roll_width": {"edge_share": 0.0}}, "must be at least 0.001"),
         ({"roll_width": {"slices": 0}}, "must be at least 1"),
     ],
 )
