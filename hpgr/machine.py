@@ -267,9 +267,15 @@ def at_operating_gap(scene: Scene) -> Scene:
     def excess(log_gap: float) -> float:  # nearly straight in logs; without any force it is far below
         return math.log(max(pressing_force(at(log_gap)) / wanted, _NO_FORCE))
 
+    if narrow >= wide:
+        raise ValueError(
+            f"rolls.entry_gap: got {units.show(scene.rolls.entry_gap, 'm')}; must be above "
+            f"{units.show(scene.rolls.entry_gap + narrow - wide, 'm')} for the gap to float below it, the narrowest gap "
+            f"being {units.show(narrow, 'm')}, below which {_why_no_narrower(scene)}; begin the bed higher"
+        )
     ends = math.log(narrow), math.log(wide)
-    if narrow >= wide or not excess(ends[0]) >= 0 >= excess(ends[1]):
-        reach = [pressing_force(at(end)) for end in ends] if narrow < wide else [0.0, 0.0]
+    if not excess(ends[0]) >= 0 >= excess(ends[1]):
+        reach = [pressing_force(at(end)) for end in ends]
         raise ValueError(
             f"rolls.specific_pressing_force: got {units.show(wanted, 'Pa')}; must lie within the reachable "
             f"{units.show(reach[1], 'Pa')} (gap {units.show(wide, 'm')}) to {units.show(reach[0], 'Pa')} (gap "

@@ -197,7 +197,7 @@ def _notes(scene: Scene, prepared: Prepared, crushed: solve.Crushed | None) -> d
     bed, state = prepared.bed, prepared.state
     ore, rolls = scene.material, scene.rolls
     needed = float(state.continuity_solid_fraction.max())
-    if not state.pressure.any():
+    if not state.pressure.astype(np.float32).any():  # as it is stored: of less nothing would be seen
         why = "the gap equals the entry gap" if bed.height == 0 else "the bed only dilates on its way to the gap"
         notes["no_compaction"] = f"{why}: nothing is compacted nor pressed, the product is the feed"
     if needed > ore.max_solid_fraction:

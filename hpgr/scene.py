@@ -30,8 +30,8 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from hpgr import tables, units
 
-# The largest entry angle the cubic streamlines allow: above it their half width no longer grows with height.
 LEAST_GAP = 1e-6  # m
+# The largest entry angle the cubic streamlines allow: above it their half width no longer grows with height.
 _STEEPEST_ENTRY = 0.5  # (entry gap - gap) / diameter, reached at an entry angle of 60 degrees
 
 

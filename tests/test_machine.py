@@ -353,3 +353,9 @@ def test_simulate_reports_the_operating_gap_and_keeps_it_in_the_scene():
     assert kept.rolls.specific_pressing_force == 3.5e6
     assert simulate(kept).identical(dataset)
     assert "operating_gap" not in simulate(pilot())
+
+
+def test_bed_too_low_for_any_gap_is_refused_with_the_entry_gap_it_needs():
+    steep = {"flow.nip_angle": "59 deg", "rolls.specific_pressing_force": 1e6}
+    with pytest.raises(ValueError, match=r"rolls.entry_gap: got 60 mm; must be above .* begin the bed higher"):
+        machine.at_operating_gap(presets.khd_pilot().with_values(steep))
