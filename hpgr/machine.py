@@ -270,8 +270,8 @@ def at_operating_gap(scene: Scene) -> Scene:
     if narrow >= wide:
         raise ValueError(
             f"rolls.entry_gap: got {units.show(scene.rolls.entry_gap, 'm')}; must be above "
-            f"{units.show(scene.rolls.entry_gap + narrow - wide, 'm')} for the gap to float below it, the narrowest gap "
-            f"being {units.show(narrow, 'm')}, below which {_why_no_narrower(scene)}; begin the bed higher"
+            f"{units.show(scene.rolls.entry_gap + narrow - wide, 'm')} for the gap to float below it, the narrowest "
+            f"gap being {units.show(narrow, 'm')}, below which {_why_no_narrower(scene)}; begin the bed higher"
         )
     ends = math.log(narrow), math.log(wide)
     if not excess(ends[0]) >= 0 >= excess(ends[1]):

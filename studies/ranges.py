@@ -4,7 +4,7 @@ A field that a scene gains later is walked and drawn without a line here.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 import numpy as np
@@ -170,24 +170,35 @@ def draw(base: Scene, generator: np.random.Generator, exchange: bool, most_secon
     drawn |= zip(fractions, sorted(fractions.values()), strict=True)
     drawn |= _draw_feed(drawn.get("rolls.entry_gap", base.rolls.entry_gap), generator)
     drawn |= _draw_resolution(exchange, generator)
-    _reconcile(drawn, exchange, generator)
+    _reconcile(base, drawn, exchange, generator)
     return _affordable(base, drawn, most_seconds)
 
 
-def _reconcile(drawn: dict[str, Any], exchange: bool, generator: np.random.Generator) -> None:
+def _reconcile(base: Scene, drawn: dict[str, Any], exchange: bool, generator: np.random.Generator) -> None:
     """Take out what excludes each other: two nips or none, slices of the roll width with exchange or whole records."""
-    nips = ["flow.nip_angle", "flow.cake_solid_fraction"]
-    for name in nips:
+    for name in ("flow.nip_angle", "flow.cake_solid_fraction"):
         drawn.pop(name, None)
     if drawn.get("flow.profile") == "nip":
-        name = nips[generator.integers(2)]
-        drawn[name] = numeric_fields()[name].at(generator.random())
+        drawn |= _draw_nip(base, drawn, generator)
     width = [name for name in drawn if name.startswith("roll_width.")]
     if exchange or generator.random() < 0.5:
         for name in width:
             del drawn[name]
     elif width:
         drawn["resolution.record"] = "product"
+
+
+def _draw_nip(base: Scene, drawn: Mapping[str, Any], generator: np.random.Generator) -> dict[str, float]:
+    """Return a nip angle within the bed, or, once in two, the cake's solid fraction that has such a nip."""
+    diameter = drawn.get("rolls.diameter", base.rolls.diameter)
+    gap, entry_gap = drawn["rolls.gap"], drawn["rolls.entry_gap"]
+    feed, densest = (drawn[f"material.{name}_solid_fraction"] for name in ("feed", "max"))
+    steepest = math.acos(max(1 - (entry_gap - gap) / diameter, 0.5))
+    angle = min(max(steepest * generator.random(), 1e-3), 1.0)
+    cake = feed * math.cos(angle) * (gap + diameter * (1 - math.cos(angle))) / gap  # as hpgr.flow.nip_angle has it
+    if generator.random() < 0.5 and feed <= cake <= densest:
+        return {"flow.cake_solid_fraction": cake}
+    return {"flow.nip_angle": angle}
 
 
 def _draw_number(known: Range, generator: np.random.Generator) -> float:

@@ -12,6 +12,7 @@ from support import sized
 
 import hpgr
 from hpgr.scene import field_value
+from hpgr.schema import FLAGS
 from studies import extremes, ranges, stability
 from studies.extremes import KINDS, Outcome, Row, Walked, judge
 from studies.plots import extremes as plots
@@ -45,7 +46,7 @@ def test_catalogue_has_an_outcome_of_every_kind():
 
 def test_an_outcome_that_is_not_the_wanted_one_is_a_fault():
     found = judge({})
-    assert found == Outcome("ok")
+    assert found == Outcome("ok", FLAGS["unusual_machine"], message="unusual_machine")  # no limit of the model
     assert extremes._as_wanted(Row("as it is", {}, "ok"), found) == found
     for row in (Row("refused?", {}, "refused"), Row("said?", {}, "ok", ("no_breakage",))):
         assert extremes._as_wanted(row, found).kind == "fault"
@@ -132,18 +133,22 @@ def corrupted(name, value):
         (warning, "RuntimeWarning: invalid value"),
         (corrupted("pressure", math.nan), "finite: pressure holds nan"),
         (corrupted("pressure", -1.0), "stresses not negative: pressure falls to"),
-        (corrupted("flags", 0), "ok"),
+        (corrupted("flags", 0), "flags: flags say none, notes say unusual_machine"),
         (corrupted("throughput", 0.0), "throughput: throughput is 0"),
     ],
 )
 def test_a_silent_fault_is_seen(monkeypatch, simulate, says):
     monkeypatch.setattr(hpgr, "simulate", simulate)
     found = judge({})
-    if says == "ok":  # nothing to flag in this scene; one that has something is next
-        assert found.kind == "ok"
-        found, says = judge({"resolution.cells": 2}), "flags: few_cells is missing"
     assert found.kind == "fault"
     assert says in found.message
+
+
+def test_a_limit_that_is_not_flagged_is_seen(monkeypatch):
+    monkeypatch.setattr(hpgr, "simulate", corrupted("flags", 0))
+    found = judge({"resolution.cells": 2})
+    assert found.kind == "fault"
+    assert "flags: few_cells is missing" in found.message
 
 
 def test_a_refusal_in_its_form_is_none(monkeypatch):

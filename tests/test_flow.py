@@ -329,14 +329,14 @@ def test_force_does_not_jump_as_the_nip_crosses_a_point():
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        (PILOT, r"flow.nip_angle.*\n.*got nothing; profile 'nip' needs either"),
+        (PILOT, r"flow.nip_angle.*\n.*got nothing; must be one of nip_angle"),
         (PILOT | {"flow.nip_angle": 0.1, "flow.cake_solid_fraction": 0.8}, "got nip_angle and cake_solid_fraction"),
-        ({"flow.nip_angle": 0.1}, "profile 'power' has no nip; leave it out"),
+        ({"flow.nip_angle": 0.1}, "must not be given with profile 'power', which has no nip; leave it out"),
         (PILOT | {"flow.cake_solid_fraction": 0.95}, "must lie within feed_solid_fraction 0.6 to max_solid_fraction"),
         (PILOT | {"flow.cake_solid_fraction": 0.5}, "must lie within feed_solid_fraction 0.6 to"),
         (
             PILOT | {"flow.cake_solid_fraction": 0.9, "rolls.gap": 0.3, "rolls.entry_gap": 0.5},
-            "no nip angle feeds so dense a cake; must be at most 0.756; give a lighter cake or a narrower gap",
+            "must be at most 0.756, beyond which no nip angle feeds the cake; give a lighter cake or a narrower",
         ),
         (PILOT | {"flow.nip_angle": "20 deg"}, "rolls.entry_gap\n.*at least 71.9.* mm, the roll distance at the nip"),
         (PILOT | {"flow.nip_angle": "61 deg"}, "must be less than 60 deg"),

@@ -296,7 +296,8 @@ def test_help_explains_every_option_and_loads_nothing_heavy():
 
 def test_scenes_in_which_nothing_happens_are_drawn(tmp_path):
     """No pressure at all, hence no contour lines, no crushing, and one size everywhere in the animation."""
-    small = {"resolution.streamlines": 1, "resolution.points": 11, "resolution.cells": 20, "flow.exponent": 2.0}
+    small = {"resolution.streamlines": 1, "resolution.points": 11, "resolution.cells": 20}
+    small |= {"flow.profile": "power", "flow.nip_angle": None, "flow.exponent": 2.0, "rolls.entry_gap": 0.163}
     scene = hpgr.presets.khd_pilot().with_values(small)
     result = study.study(scene, 6, assumptions=False)
     assert not result["pressure"].any()

@@ -1,4 +1,5 @@
 import math
+import re
 
 import numpy as np
 import pytest
@@ -100,13 +101,28 @@ def test_axes_keep_their_order(result):
 
 
 def test_table_holds_every_operating_point_in_order(result):
-    lines = report.table(result, 1e-3).splitlines()
-    assert len({len(line) for line in lines[:-1]}) == 1  # columns are aligned
-    assert lines[0].split("  ")[0] == "roll speed [rpm]"
-    rows = [line.split()[:2] for line in lines[1:7]]
-    assert rows == [["10", "60"], ["10", "40"], ["20", "60"], ["20", "40"], ["30", "60"], ["30", "40"]]
-    assert lines[-1] == "(mean ± standard deviation of 3 replicates)"
-    assert all("±" in line for line in lines[1:])
+    product, machine = report.table(result, 1e-3).split("\n\n")
+    *machine, last = machine.splitlines()
+    assert last == "(mean ± standard deviation of 3 replicates)"
+    for lines in (product.splitlines(), machine):
+        assert len({len(line) for line in lines}) == 1  # columns are aligned
+        assert lines[0].split("  ")[0] == "roll speed [rpm]"
+        rows = [line.split()[:2] for line in lines[1:]]
+        assert rows == [["10", "60"], ["10", "40"], ["20", "60"], ["20", "40"], ["30", "60"], ["30", "40"]]
+        assert all("±" in line for line in lines[1:])
+
+
+def test_table_has_force_power_and_energy_in_the_units_people_use(result):
+    one = result.isel(roll_speed=[0], gap=[0], replicate=[0])
+    heading, row = report.table(one, 1e-3).split("\n\n")[1].splitlines()
+    shown = dict(zip(re.split(r"\s{2,}", heading.strip()), row.split(), strict=True))
+    for name, (column, factor) in {
+        "specific_pressing_force": ("Fsp [N/mm²]", 1e-6), "pressing_force": ("force [kN]", 1e-3),
+        "torque": ("torque [kN m]", 1e-3), "power": ("power [kW]", 1e-3), "specific_energy": ("W [kWh/t]", 1 / 3600),
+        "specific_throughput": ("mdot [t s/(h m³)]", 3.6), "nip_angle": ("nip [deg]", 180 / np.pi),
+        "force_angle": ("beta [deg]", 180 / np.pi),
+    }.items():  # fmt: skip
+        assert float(shown[column]) == pytest.approx(float(one[name].item()) * factor, rel=1e-3), name
 
 
 def test_table_of_one_replicate_has_no_spread(result):
@@ -132,9 +148,10 @@ def test_table_without_results(result):
 
 def test_table_without_axes(swept):
     base = paper({"resolution.streamlines": 2, "resolution.points": 20, "resolution.cells": 0})
-    lines = report.table(sweep(base, {}), 1e-3).splitlines()
-    assert lines[0].split("  ") == ["throughput [t/h]", "peak pressure [MPa]"]
-    assert len(lines) == 2
+    product, machine = (part.splitlines() for part in report.table(sweep(base, {}), 1e-3).split("\n\n"))
+    assert product[0].split("  ") == ["throughput [t/h]", "peak pressure [MPa]"]
+    assert machine[0].startswith("Fsp [N/mm²]")
+    assert len(product) == len(machine) == 2
 
 
 def test_lost_cases_are_grouped_by_place_and_reason(result):
