@@ -67,7 +67,7 @@ def parse(text: str, unit: str) -> float:
         raise ValueError(f"not a quantity in {shown}: its unit {named!r} {fault}") from None
 
 
-def show(value: float, unit: str) -> str:
+def show(value: float, unit: str, digits: int = 6) -> str:
     """Return `value`, given in the SI unit `unit`, as short text in the unit people use."""
     shown, factor = SHOWN.get(unit, (unit, 1.0))
-    return f"{value * factor:.6g}" + ("" if shown == "1" else f" {shown}")
+    return f"{value * factor:.{digits}g}" + ("" if shown == "1" else f" {shown}")

@@ -21,6 +21,7 @@ _LETTERS = {  # flag -> letter in a map
     "size_floor_reached": "F",
     "tension_clamped": "T",
     "few_cells": "M",
+    "no_limit_of_steps": "L",
 }
 _MEANINGS = {
     "C": "solid fraction capped",
@@ -30,6 +31,7 @@ _MEANINGS = {
     "F": "size floor reached",
     "T": "tension held at 0",
     "M": "few cells",
+    "L": "no limit of small steps",
 }
 _SHADES = ("white", "0.86", "0.68", "0.35", "black")  # ok, flagged, substepped, refused, fault
 _WORDS = ("·  ok", "flagged (letters)", "substepped (number of passes, letters)", "×  refused", "!  silent fault")

@@ -3,6 +3,8 @@
 Lines differ by marker, dash and lightness, so that every figure can be read in black and white.
 """
 
+import textwrap
+
 import cmcrameri.cm as maps
 import numpy as np
 import xarray as xr
@@ -50,7 +52,8 @@ def sweep_figure(result: xr.Dataset, field: str, sieve: float, caption: str) -> 
         words.append(f"Mean of {result.sizes['replicate']} replicates; bars: ± one standard deviation.")
     words += [line[0].upper() + line[1:] + "." for line in report.flags(result)]
     note = Scene.model_validate_json(result.attrs["scene"]).note
-    figure.supxlabel("\n".join([*words, *([f"Scene: {note}."] if note else [])]), fontsize=9)
+    words += [f"Scene: {note}."] if note else []
+    figure.supxlabel("\n".join(textwrap.fill(line, int(14 * figure.get_figwidth())) for line in words), fontsize=9)
     return figure
 
 
