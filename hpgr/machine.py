@@ -182,7 +182,7 @@ def unusual(scene: Scene, found: Figures, exit_solid_fraction: float) -> str:
         "exit solid fraction": exit_solid_fraction,
     }
     return "; ".join(
-        f"{name} {units.show(values[name], unit, 3)} (usual {units.show(low, unit)} to {units.show(high, unit)})"
+        f"{name} {units.show(values[name], unit, 4)} (usual {units.show(low, unit)} to {units.show(high, unit)})"
         for name, (low, high, unit) in USUAL.items()
         if not low <= values[name] <= high
     )

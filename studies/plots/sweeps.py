@@ -53,7 +53,9 @@ def sweep_figure(result: xr.Dataset, field: str, sieve: float, caption: str) -> 
     words += [line[0].upper() + line[1:] + "." for line in report.flags(result)]
     note = Scene.model_validate_json(result.attrs["scene"]).note
     words += [f"Scene: {note}."] if note else []
-    figure.supxlabel("\n".join(textwrap.fill(line, int(14 * figure.get_figwidth())) for line in words), fontsize=9)
+    width = int(14 * figure.get_figwidth())  # letters
+    folded = [textwrap.fill(line, width) for line in "\n".join(words).splitlines()]
+    figure.supxlabel("\n".join(folded), fontsize=9)
     return figure
 
 
