@@ -172,7 +172,7 @@ def unusual(scene: Scene, found: Figures, exit_solid_fraction: float) -> str:
     >>> scene = hpgr.presets.industrial()
     >>> found = machine.figures(scene, machine.Press(8e6, 4e5, 0.159), throughput=200.0)
     >>> machine.unusual(scene, found, exit_solid_fraction=0.85)
-    'specific energy 0.555556 kWh/t (usual 1 kWh/t to 3 kWh/t)'
+    'specific energy 0.5556 kWh/t (usual 1 kWh/t to 3 kWh/t)'
     """
     values = {
         "roll diameter": scene.rolls.diameter,
