@@ -85,9 +85,11 @@ def crush(scene: Scene, prepared: Prepared, seed: int, replicate: int) -> dict[s
     """
     bed, motion, state = prepared.bed, prepared.motion, prepared.state
     crushed = solve.crush(scene, prepared.crushing, motion.time_step, prepared.rates, seed, replicate)
-    summaries = _summaries(scene, prepared)
+    throughput = metrics.gap_throughput(scene, float(state.solid_fraction[:, -1].mean()))
+    felt = machine.figures(scene, prepared.pressed, throughput)
+    summaries = _summaries(scene, prepared) | felt._asdict() | {"throughput": throughput}
     values = _fields(bed, motion, state) | summaries | _product(scene, crushed)
-    notes = _notes(scene, prepared, crushed)
+    notes = _notes(scene, prepared, felt, crushed)
     return values | {
         "volume": prepared.volume,
         "flags": sum(schema.FLAGS[name] for name in notes),
@@ -132,9 +134,7 @@ def _summaries(scene: Scene, prepared: Prepared) -> dict[str, Any]:
     lines = np.arange(peak.size)
     peaks, heights = pressure[lines, peak], motion.y[lines, peak]
     highest = int(peaks.argmax())
-    throughput, felt = _felt(scene, prepared)
-    return felt._asdict() | {
-        "throughput": throughput,
+    return {
         "operating_gap": None if scene.rolls.specific_pressing_force is None else scene.rolls.gap,
         "peak_pressure": peaks[highest],
         "peak_pressure_height": heights[highest],
@@ -143,11 +143,6 @@ def _summaries(scene: Scene, prepared: Prepared) -> dict[str, Any]:
         "continuity_solid_fraction": state.continuity_solid_fraction,
         "shear_limit_fraction": state.on_shear_limit.mean(),
     }
-
-
-def _felt(scene: Scene, prepared: Prepared) -> tuple[float, machine.Figures]:
-    throughput = metrics.gap_throughput(scene, float(prepared.state.solid_fraction[:, -1].mean()))
-    return throughput, machine.figures(scene, prepared.pressed, throughput)
 
 
 def _product(scene: Scene, crushed: solve.Crushed | None) -> dict[str, Any]:
@@ -191,7 +186,7 @@ def _along_width(scene: Scene, found: solve.AlongWidth) -> dict[str, Any]:
     }
 
 
-def _notes(scene: Scene, prepared: Prepared, crushed: solve.Crushed | None) -> dict[str, str]:
+def _notes(scene: Scene, prepared: Prepared, felt: machine.Figures, crushed: solve.Crushed | None) -> dict[str, str]:
     """Return, by flag, a sentence for each limit that was hit."""
     notes = {}
     bed, state = prepared.bed, prepared.state
@@ -216,7 +211,6 @@ def _notes(scene: Scene, prepared: Prepared, crushed: solve.Crushed | None) -> d
         notes["no_limit_of_steps"] = (
             f"with elastic_exponent {ore.elastic_exponent:g}, below 0, stresses need not converge as time steps shrink"
         )
-    _, felt = _felt(scene, prepared)
     unusual = machine.unusual(scene, felt, float(state.solid_fraction[:, -1].mean()))
     if unusual:
         notes["unusual_machine"] = unusual

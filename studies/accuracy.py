@@ -20,6 +20,7 @@ import tyro
 from hpgr.keys import refuse_key
 from hpgr.scene import LEVELS, Scene
 from studies.command import base_scene, refusing, shown_as
+from studies.progress import progress_bar
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -150,7 +151,7 @@ def study(scene: Scene, plan: Plan, seed: int = 0, progress: bool = False) -> "x
     scene = scene.with_values({"resolution.record": "product", "resolution.sieves": [_SIEVE]})
     ladders = _ladders(scene, plan)
     total = sum(len(ladder.scenes) * ladder.replicates for ladder in ladders.values())
-    with _bar(total, progress) as bar:
+    with progress_bar(total, progress, "runs") as bar:
         samples = {name: _climb(ladder, seed, bar) for name, ladder in ladders.items()}
         stored = _storage(_at(scene, *plan.held), seed, plan.replicates)
     return _dataset(scene, plan, seed, ladders, samples, stored)
@@ -372,16 +373,6 @@ def _storage(scene: Scene, seed: int, replicates: int) -> dict[str, np.ndarray]:
     scale = np.maximum(double, [0, 0, _LEAST_PERCENT])
     apart = np.abs(products[0] - products[1]) > 1e-4 * products[1]
     return {"difference": (single - double) / scale, "cells_apart": apart.mean(axis=(1, 2))}
-
-
-def _bar(total: int, progress: bool) -> Any:
-    """Return a progress bar; where no terminal is watching, a plain line every few seconds."""
-    from tqdm import tqdm
-
-    if sys.stderr.isatty():
-        return tqdm(total=total, unit=" runs", disable=not progress)
-    line = "{n_fmt} of {total_fmt} runs, {elapsed}\n"
-    return tqdm(total=total, unit=" runs", disable=not progress, bar_format=line, mininterval=5)
 
 
 def _limit(means: np.ndarray) -> np.ndarray:

@@ -25,6 +25,7 @@ from hpgr.keys import refuse_key
 from hpgr.scene import Scene
 from studies import ranges
 from studies.command import refusing, shown_as
+from studies.progress import progress_bar
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -328,16 +329,6 @@ def _as_wanted(row: Row, found: Outcome) -> Outcome:
         return found
     says = f" saying {', '.join(row.says)}" if row.says else ""
     return found._replace(kind="fault", message=f"wanted {row.wanted}{says}, found {found.kind}: {found.message}")
-
-
-def progress_bar(total: int, progress: bool, unit: str) -> Any:
-    """Return a progress bar; where no terminal is watching, a plain line every few seconds."""
-    from tqdm import tqdm
-
-    if sys.stderr.isatty():
-        return tqdm(total=total, unit=f" {unit}", disable=not progress)
-    line = f"{{n_fmt}} of {{total_fmt}} {unit}, {{elapsed}}\n"
-    return tqdm(total=total, unit=f" {unit}", disable=not progress, bar_format=line, mininterval=5)
 
 
 def add_walked(result: "xr.Dataset", walked: Sequence[Walked]) -> None:

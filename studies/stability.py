@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hpgr.scene import field_info
 from studies import extremes
+from studies.progress import progress_bar
 
 if TYPE_CHECKING:
     import numpy as np
@@ -66,7 +67,7 @@ def maps(judge: Callable[..., "extremes.Outcome"], thin: int = 1, progress: bool
     thinned = {name: [axis._replace(values=axis.values[::thin]) for axis in axes] for name, axes in MAPS.items()}
     result = xr.Dataset(attrs={"title": "Numerical extremes: outcomes and stability maps", "Conventions": "CF-1.11"})
     total = sum(math.prod(len(axis.values) for axis in axes) for axes in thinned.values())
-    with extremes.progress_bar(total, progress, "scenes of the maps") as bar:
+    with progress_bar(total, progress, "scenes of the maps") as bar:
         for name, axes in thinned.items():
             dims = [f"{name}_{axis.field.partition('.')[2]}" for axis in axes]
             shape = tuple(len(axis.values) for axis in axes)

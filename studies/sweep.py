@@ -6,7 +6,6 @@ and message beside it.
 """
 
 import itertools
-import sys
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
@@ -24,6 +23,7 @@ from hpgr.scene import Scene, field_info, field_value, level_text
 from studies import recorded, runner
 from studies.bench import LIBRARIES, STATUS, Case, Job, Outcome
 from studies.cases import Addresses, CaseFolder, code_version, outcome_of, read_folder, say
+from studies.progress import progress_bar
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -290,7 +290,7 @@ def _computed(plan: _Plan, client: Any, progress: bool) -> Iterator[Outcome]:
     plan.batch = _batch_size(plan, workers)
     if progress:
         say(_prediction(plan, workers))
-    with _bar(plan.total, plan.total - plan.left, progress) as bar:
+    with progress_bar(plan.total, progress, "cases", "{rate_fmt}, {remaining} left", plan.total - plan.left) as bar:
         for outcome in runner.outcomes(plan.job, plan, client):
             yield plan.settle(outcome)
             bar.update(plan.total - plan.left - bar.n)
@@ -321,16 +321,6 @@ def _prediction(plan: _Plan, workers: int) -> str:
         f"{plan.left} cases to compute on {workers} thread{'s' * (workers > 1)}: predicted {seconds:.2g} s, "
         f"at most {most / 1e6:.3g} MB a case{before}"
     )
-
-
-def _bar(total: int, done: int, progress: bool):
-    """Return a progress bar; where no terminal is watching, a plain line every few seconds."""
-    from tqdm import tqdm
-
-    if sys.stderr.isatty():
-        return tqdm(total=total, initial=done, unit=" cases", disable=not progress)
-    line = "{n_fmt} of {total_fmt} cases, {rate_fmt}, {remaining} left\n"
-    return tqdm(total=total, initial=done, unit=" cases", disable=not progress, bar_format=line, mininterval=5)
 
 
 def _assemble(job: Job, grid, replicates: int, outcomes: Iterable[Outcome], plan: _Plan) -> "xr.Dataset":
