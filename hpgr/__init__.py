@@ -5,30 +5,50 @@ Names load on first use: a study's `--help` needs neither the compiler nor xarra
 
 from importlib import import_module
 from importlib.metadata import version
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hpgr import presets
+    from hpgr.bed.machine import operating_gap
+    from hpgr.calibration import calibrate
+    from hpgr.results.metrics import passing, peak_pressure, percentile_size, reduction_ratio, throughput
+    from hpgr.run import simulate
+    from hpgr.scene import Bed, Exchange, Resolution, Rolls, Scene
 
 __version__ = version("hpgr")
 
 _HOMES = {
     "Scene": "scene",
     "Rolls": "scene",
-    "Material": "scene",
-    "Feed": "scene",
-    "Flow": "scene",
-    "Stress": "scene",
+    "Bed": "scene",
     "Exchange": "scene",
     "Resolution": "scene",
     "simulate": "run",
-    "passing": "metrics",
-    "percentile_size": "metrics",
-    "throughput": "metrics",
-    "peak_pressure": "metrics",
-    "reduction_ratio": "metrics",
-    "operating_gap": "machine",
+    "passing": "results.metrics",
+    "percentile_size": "results.metrics",
+    "throughput": "results.metrics",
+    "peak_pressure": "results.metrics",
+    "reduction_ratio": "results.metrics",
+    "operating_gap": "bed.machine",
     "calibrate": "calibration",
 }
 
-__all__ = [*_HOMES, "presets"]
+__all__ = [
+    "Bed",
+    "Exchange",
+    "Resolution",
+    "Rolls",
+    "Scene",
+    "calibrate",
+    "operating_gap",
+    "passing",
+    "peak_pressure",
+    "percentile_size",
+    "presets",
+    "reduction_ratio",
+    "simulate",
+    "throughput",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,17 +1,88 @@
-"""simulate(scene) -> Dataset: what a user calls.
+"""The one door from a scene to its results: floats the gap, loads the bed, crushes the feed, labels what comes out.
 
 Not simulate.py: importing a module of that name would replace the function `hpgr.simulate` by the module.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import xarray as xr
 
-from hpgr import __version__, budget, machine, pipeline, schema, solve
-from hpgr import tolerance as tolerances
-from hpgr.keys import refuse_key
-from hpgr.pipeline import Prepared
-from hpgr.scene import Scene, level_text
+from hpgr import cost
+from hpgr.bed import machine
+from hpgr.bed.loaded import Beds, LoadedBed, inputs_of, load_bed
+from hpgr.fields import check_seed
+from hpgr.grains import solve
+from hpgr.results import flags, metrics, schema
+from hpgr.scene import Scene
+
+
+class Result(NamedTuple):
+    """What a run gives.
+
+    Attributes
+    ----------
+    scene : Scene
+        The scene that was run, its gap the one that carries the pressing force.
+    bed : LoadedBed
+        Its loaded bed.
+    values : dict
+        Every variable of the Dataset by name, unrounded; None where the scene has none.
+    diagnostics : str
+        A line for each limit that was hit.
+    solver : str
+        Which solver crushed.
+    """
+
+    scene: Scene
+    bed: LoadedBed
+    values: dict[str, Any]
+    diagnostics: str
+    solver: str
+
+
+def load(scene: Scene, beds: Beds | None = None) -> tuple[Scene, LoadedBed]:
+    """Return `scene` with the gap that carries its pressing force, and the bed loaded there.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is simulated; its gap is kept if it has no specific pressing force.
+    beds : Beds, optional
+        Loaded beds to be shared by scenes that differ in the ore's strength, fragments or cells alone.
+
+    Raises
+    ------
+    ValueError
+        If no gap carries the pressing force, or material points coincide.
+    """
+    scene = machine.float_gap(scene)
+    inputs = inputs_of(scene, tessellated=solve.choose(scene) == "lattice")
+    return scene, load_bed(inputs) if beds is None else beds.load(inputs)
+
+
+def run_scene(scene: Scene, seed: int = 0, replicate: int = 0, beds: Beds | None = None) -> Result:
+    """Run `scene`, its gap floated.
+
+    Studies take their figures from here: making a Dataset of every case would cost them as much as crushing.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr.run import run_scene
+    >>> result = run_scene(hpgr.presets.industrial().with_values({"rolls.specific_pressing_force": "4 N/mm^2"}))
+    >>> round(result.scene.rolls.gap, 4), round(float(result.values["specific_pressing_force"]))
+    (0.0538, 4000000)
+    """
+    scene, bed = load(scene, beds)
+    crushed = solve.crush(scene, bed, seed, replicate)
+    throughput = metrics.gap_throughput(scene, float(bed.stress.solid_fraction[:, -1].mean()))
+    performance = machine.performance(scene, bed.pressed, throughput)
+    found = flags.diagnose(scene, bed, performance, crushed)
+    values = _fields(bed) | _summaries(scene, bed) | performance._asdict() | {"throughput": throughput}
+    values |= _product(scene, crushed) | {"flags": sum(flags.BITS[name] for name in found)}
+    diagnostics = "\n".join(f"{name}: {words}" for name, words in found.items())
+    return Result(scene, bed, values, diagnostics, solve.choose(scene))
 
 
 def simulate(
@@ -37,15 +108,15 @@ def simulate(
     Returns
     -------
     xarray.Dataset
-        Dims time (photographs of the steady machine), streamline (mid-plane to roll), point (entry to
+        Dims time (snapshots of the steady machine), streamline (mid-plane to roll), point (entry to
         exit), cell and sieve; SI units. `attrs["scene"]` rebuilds the scene with
-        `Scene.model_validate_json`; `flags` and `attrs["notes"]` tell which limits were hit.
+        `Scene.model_validate_json`; `flags` and `attrs["diagnostics"]` tell which limits were hit.
 
     Raises
     ------
     ValueError
         If the seed or replicate is not a whole number from 0 to 2**63 - 1, if material points coincide, if exchange
-        would need absurdly many passes, if no gap carries the scene's pressing force, or if the tolerance cannot be
+        would need absurdly many substeps, if no gap carries the scene's pressing force, or if the tolerance cannot be
         met under `max_cost`.
     MemoryError
         If the scene does not fit this machine's memory; the message has the predicted bytes.
@@ -58,32 +129,108 @@ def simulate(
     >>> dict(dataset["size"].sizes)
     {'time': 1, 'streamline': 10, 'point': 50, 'cell': 200}
     """
-    refuse_key("seed", seed)
-    refuse_key("replicate", replicate)
+    check_seed("seed", seed)
+    check_seed("replicate", replicate)
     chosen = {}
-    scene = machine.at_operating_gap(scene)
     if tolerance is not None:
-        estimate = tolerances.refine(scene, tolerance, max_cost, seed)
-        scene, chosen = machine.at_operating_gap(estimate.scene), estimate.variables()
-    budget.refuse_too_large(scene)
-    prepared = pipeline.prepare(scene)
-    values = pipeline.crush(scene, prepared, seed, replicate)
-    notes = values.pop("notes")
-    values |= chosen
-    return schema.to_dataset(values, _attributes(scene, seed, replicate, prepared) | {"notes": notes})
+        from hpgr.tolerance import refine  # it runs scenes itself
+
+        estimate = refine(scene, tolerance, max_cost, seed)
+        scene, chosen = estimate.scene, estimate.variables()
+    cost.refuse_too_large(scene)
+    result = run_scene(scene, seed, replicate)
+    history = f"hpgr {schema.VERSION}: simulate(scene, seed={seed}, replicate={replicate})"
+    title = "Comminution in high pressure grinding rolls, heterarchical model"
+    return schema.to_dataset(result.values | chosen, attributes(result, title, seed, replicate) | {"history": history})
 
 
-def _attributes(scene: Scene, seed: int, replicate: int, prepared: Prepared) -> dict[str, Any]:
+def attributes(result: Result, title: str, seed: int, replicate: int) -> dict[str, Any]:
+    """Return the attributes of a Dataset of one run."""
+    return schema.dataset_attributes(
+        title,
+        scene=result.scene.model_dump_json(),
+        seed=int(seed),
+        replicate=int(replicate),
+        solver=result.solver,
+        time_step_s=result.bed.kinematics.time_step,
+        streamline_deviation_m=result.bed.geometry.deviation(),
+        diagnostics=result.diagnostics,
+    )
+
+
+def _fields(bed: LoadedBed) -> dict[str, Any]:
+    motion, state = bed.kinematics, bed.stress
     return {
-        "level": level_text(scene.resolution.level),
-        "Conventions": "CF-1.11",
-        "title": "Comminution in high pressure grinding rolls, heterarchical model",
-        "source": f"hpgr {__version__}",
-        "history": f"hpgr {__version__}: simulate(scene, seed={seed}, replicate={replicate})",
-        "scene": scene.model_dump_json(),
-        "seed": int(seed),
-        "replicate": int(replicate),
-        "solver": solve.choose(scene),
-        "time_step_s": prepared.motion.time_step,
-        "streamline_deviation_m": prepared.bed.deviation(),
+        "xi": bed.geometry.xi,
+        "x": motion.x,
+        "height": motion.y,
+        "residence_time": np.broadcast_to(motion.residence_time, motion.x.shape),
+        "speed": motion.speed,
+        "volumetric_strain_rate": motion.volumetric_rate,
+        "shear_strain_rate": motion.shear_rate,
+        "volumetric_strain": state.volumetric_strain,
+        "shear_strain": state.shear_strain,
+        "solid_fraction": state.solid_fraction,
+        "pressure": state.pressure,
+        "shear_stress": state.shear_stress,
+        "on_shear_limit": state.on_shear_limit,
+        "volume": None if bed.tessellation is None else bed.tessellation.volume,
+    }
+
+
+def _summaries(scene: Scene, bed: LoadedBed) -> dict[str, Any]:
+    pressure = bed.stress.pressure
+    peak = pressure.argmax(axis=1)
+    lines = np.arange(peak.size)
+    peaks, heights = pressure[lines, peak], bed.kinematics.y[lines, peak]
+    highest = int(peaks.argmax())
+    return {
+        "operating_gap": None if scene.rolls.specific_pressing_force is None else scene.rolls.gap,
+        "peak_pressure": peaks[highest],
+        "peak_pressure_height": heights[highest],
+        "streamline_peak_pressure": peaks,
+        "streamline_peak_pressure_height": heights,
+        "continuity_solid_fraction": bed.stress.continuity_solid_fraction,
+        "shear_limit_fraction": bed.stress.on_shear_limit.mean(),
+    }
+
+
+def _product(scene: Scene, crushed: solve.Crushed | None) -> dict[str, Any]:
+    if crushed is None:
+        return {}
+    frames = next((part.shape[0] for part in (crushed.size, crushed.mass_fraction) if part is not None), None)
+    values = {
+        "time": None if frames is None else np.arange(frames),
+        "sieve": scene.resolution.sieves,
+        "size": crushed.size,
+        "mass_fraction": crushed.mass_fraction,
+        "passing": crushed.passing,
+        "passing_total": crushed.passing.mean(axis=0),
+        "p50": crushed.percentiles[0],
+        "p80": crushed.percentiles[1],
+        "p50_total": crushed.total_percentiles[0],
+        "p80_total": crushed.total_percentiles[1],
+        "breaks_per_cell": crushed.breaks,
+        "below_floor": crushed.below_floor,
+    }
+    if crushed.along_width is not None:
+        values |= _along_width(scene, crushed.along_width)
+    exchanged = crushed.exchanged
+    if exchanged is not None:
+        values |= {"swaps_per_cell": exchanged.swaps_per_cell, "exchange_substeps": exchanged.substeps}
+        if frames is not None:
+            values |= {"elapsed_time": exchanged.elapsed_time, "steady": exchanged.steady}
+    return values
+
+
+def _along_width(scene: Scene, found: solve.AlongWidth) -> dict[str, Any]:
+    return {
+        "width_position": scene.roll_width.cut().position,
+        "passing_slice": found.passing,
+        "passing_width_centre": found.centre_passing,
+        "passing_width_edge": found.edge_passing,
+        "p50_width_centre": found.centre_percentiles[0],
+        "p80_width_centre": found.centre_percentiles[1],
+        "p50_width_edge": found.edge_percentiles[0],
+        "p80_width_edge": found.edge_percentiles[1],
     }

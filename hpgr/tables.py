@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hpgr import units
+from hpgr.fields import parse
 
 _UNIT_IN_HEADER = re.compile(r"^\s*(?:size|sieve|aperture)\w*?[\s_]*[\[(]?\s*([a-zµμ]+)\s*[\])]?\s*$", re.IGNORECASE)
 
@@ -59,7 +59,7 @@ def _metres_per_unit(header: list[str], path) -> float:
             "name the unit of the sizes, for example 'size_mm,percent_passing'"
         )
     try:
-        return units.parse(f"1 {found[1]}", "m")
+        return parse(f"1 {found[1]}", "m")
     except ValueError as error:
         raise ValueError(f"{path}: header {header[0]!r}: {error}; use a length such as mm") from None
 

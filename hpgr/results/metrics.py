@@ -7,19 +7,22 @@ All stream tubes carry equal mass, so the whole gap is their plain mean (model p
 import numpy as np
 import xarray as xr
 
-from hpgr import feed
+from hpgr.fields import parse
+from hpgr.results.schema import Variable
 from hpgr.scene import Scene
+
+_PASSING = Variable((), "1", "mass fraction passing")
 
 
 def passing(dataset: xr.Dataset, sieves=None, point: int = -1, total: bool = False) -> xr.DataArray:
-    """Return the mass fraction passing `sieves` at a material point, photographs of the steady machine pooled.
+    """Return the mass fraction passing `sieves` at a material point, snapshots of the steady machine pooled.
 
     Parameters
     ----------
     dataset : xarray.Dataset
         From `hpgr.simulate` or a study.
     sieves : array_like, optional
-        Sizes in m; default the recorded sieves. From recorded cells any size is exact; otherwise sizes
+        Sizes in m, or texts with a unit; default the recorded sieves. From recorded cells any size is exact; otherwise sizes
         between sieves are interpolated linearly in log size.
     point : int
         Material point; the default is the exit. Others need recorded cells or distributions.
@@ -40,23 +43,20 @@ def passing(dataset: xr.Dataset, sieves=None, point: int = -1, total: bool = Fal
     --------
     >>> import hpgr
     >>> dataset = hpgr.simulate(hpgr.presets.paper())
-    >>> float(hpgr.passing(dataset, [0.06], total=True)[0])
+    >>> float(hpgr.passing(dataset, ["60 mm"], total=True)[0])
     1.0
     """
     _require_sizes(dataset, point)
-    if sieves is not None and not (np.asarray(sieves, dtype=float) > 0).all():
-        raise ValueError(f"sieves: got {sieves!r}; must be sizes above 0 in m; such as [0.001]")
+    wanted = dataset["sieve"].values if sieves is None else _sizes(sieves)
     if "size" in dataset:
-        wanted = dataset["sieve"].values if sieves is None else np.atleast_1d(np.asarray(sieves, dtype=float))
         as_cells = wanted.astype(np.float32)  # a grain of just a sieve's size passes it
         found = _over_cells(
             lambda row: np.searchsorted(row, as_cells, side="right") / row.size, dataset, point, ("sieve",)
         ).assign_coords(sieve=wanted)
     else:
         found = _recorded_passing(dataset, point)
-        if sieves is not None:
-            found = between_sieves(found, np.atleast_1d(np.asarray(sieves, dtype=float)))
-    found.attrs = {"units": "1", "long_name": "mass fraction passing"}
+        found = found if sieves is None else between_sieves(found, wanted)
+    found.attrs = _PASSING.attributes()
     found = found.rename("passing")
     return found.mean("streamline", keep_attrs=True) if total else found
 
@@ -89,7 +89,7 @@ def percentile_size(dataset: xr.Dataset, percent: float, point: int = -1, total:
         result = _over_cells(lambda row: np.quantile(row, percent / 100), dataset, point, total=total)
     else:
         result = _percentile_between_sieves(_recorded_passing(dataset, point), percent / 100, total)
-    result.attrs = {"units": "m", "long_name": f"size that {percent:g} % of the mass passes"}
+    result.attrs = Variable((), "m", f"product P{percent:g}").attributes()
     return result.rename(name)
 
 
@@ -111,7 +111,7 @@ def throughput(dataset: xr.Dataset, total: bool = False) -> xr.DataArray:
         return dataset["throughput"]
     share = dataset["throughput"] / dataset.sizes["streamline"]
     found = share * xr.ones_like(dataset["xi"])
-    found.attrs = dict(dataset["throughput"].attrs, long_name="solids through the stream tube and its mirror image")
+    found.attrs = dict(dataset["throughput"].attrs, comment="solids through the stream tube and its mirror image")
     return found
 
 
@@ -144,19 +144,19 @@ def reduction_ratio(dataset: xr.Dataset, percent: float = 80, total: bool = Fals
     Examples
     --------
     >>> import hpgr
-    >>> dataset = hpgr.simulate(hpgr.presets.paper().with_values({"material.cushioning": float("inf")}))
+    >>> dataset = hpgr.simulate(hpgr.presets.paper().with_values({"strength.cushioning": float("inf")}))
     >>> 25 < float(hpgr.reduction_ratio(dataset, 80, total=True)) < 40
     True
     """
     swept = [name for name, axis in dataset.coords.items() if axis.attrs.get("scene_field", "").startswith("feed.")]
     if swept:
         raise ValueError(
-            f"the Dataset sweeps {swept[0]}, but holds the feed of its base scene only; take hpgr.feed.quantile of "
-            "each feed over hpgr.percentile_size instead"
+            f"the Dataset sweeps {swept[0]}, but holds the feed of its base scene only; take feed.quantile of "
+            "each scene over hpgr.percentile_size instead"
         )
     scene = Scene.model_validate_json(dataset.attrs["scene"])
-    ratio = feed.quantile(scene.feed, percent / 100) / percentile_size(dataset, percent, total=total)
-    ratio.attrs = {"units": "1", "long_name": f"reduction ratio F{percent:g}/P{percent:g}"}
+    ratio = scene.feed.quantile(percent / 100) / percentile_size(dataset, percent, total=total)
+    ratio.attrs = Variable((), "1", f"reduction ratio F{percent:g}/P{percent:g}").attributes()
     return ratio
 
 
@@ -166,13 +166,23 @@ def gap_throughput(scene: Scene, exit_solid_fraction: float) -> float:
     Examples
     --------
     >>> import hpgr
-    >>> from hpgr import metrics
+    >>> from hpgr.results import metrics
     >>> round(metrics.gap_throughput(hpgr.presets.paper(), exit_solid_fraction=0.9), 1)  # kg/s
     854.2
     """
     rolls = scene.rolls
-    surface_speed = rolls.speed * rolls.diameter / 2
-    return scene.material.solid_density * exit_solid_fraction * rolls.gap * rolls.width * surface_speed
+    return scene.bed.solid_density * exit_solid_fraction * rolls.gap * rolls.width * rolls.surface_speed
+
+
+def _sizes(sieves) -> np.ndarray:
+    given = [sieves] if isinstance(sieves, str) else np.atleast_1d(np.asarray(sieves, dtype=object)).tolist()
+    try:
+        found = np.array([parse(size, "m") if isinstance(size, str) else size for size in given], dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"sieves: got {sieves!r}; {error}; such as ['1 mm'], or [0.001] in m") from None
+    if not (found > 0).all():
+        raise ValueError(f"sieves: got {sieves!r}; must be sizes above 0 in m; such as ['1 mm'], or [0.001]")
+    return found
 
 
 def _require_sizes(dataset: xr.Dataset, point: int) -> None:
@@ -186,9 +196,9 @@ def _require_sizes(dataset: xr.Dataset, point: int) -> None:
 
 
 def _steady(recorded: xr.DataArray) -> xr.DataArray:
-    """Return the photographs that are not of the start-up, over `time`, which a file calls `photograph`."""
-    if "photograph" in recorded.dims:
-        recorded = recorded.rename(photograph="time")
+    """Return the snapshots that are not of the start-up, over `time`, which a file calls `snapshot`."""
+    if "snapshot" in recorded.dims:
+        recorded = recorded.rename(snapshot="time")
     if "steady" not in recorded.coords:
         return recorded
     return recorded.isel(time=np.flatnonzero(recorded["steady"].values))
@@ -199,7 +209,7 @@ def _is_exit(dataset: xr.Dataset, point: int) -> bool:
 
 
 def _over_cells(function, dataset: xr.Dataset, point: int, new_dims=(), total: bool = False) -> xr.DataArray:
-    """Apply `function` to the sorted cells of a point, photographs pooled, for each streamline or for all."""
+    """Apply `function` to the sorted cells of a point, snapshots pooled, for each streamline or for all."""
     pooled = ("streamline", "time", "cell") if total else ("time", "cell")
     return xr.apply_ufunc(
         lambda cells: function(np.sort(cells, axis=None)),
@@ -239,7 +249,7 @@ def between_sieves(found: xr.DataArray, wanted: np.ndarray) -> xr.DataArray:
     --------
     >>> import numpy as np
     >>> import xarray as xr
-    >>> from hpgr import metrics
+    >>> from hpgr.results import metrics
     >>> found = xr.DataArray([0.2, 0.6], {"sieve": [1e-3, 4e-3]}, "sieve")
     >>> metrics.between_sieves(found, np.array([2e-3])).values.round(3)
     array([0.4])

@@ -33,20 +33,20 @@ def predict(scene: Scene) -> Cost:
     """
     grid = scene.resolution
     lines, points, cells = grid.streamlines, grid.points, grid.cells
-    fields = lines * ((points - 1) * scene.stress.substeps + 1)
+    fields = lines * ((points - 1) * scene.elasticity.substeps + 1)
     size = 240 * fields  # the arrays of motion and load, 8 bytes each, with their temporaries
     seconds = 2.5e-3 + 1.5e-6 * fields
     if cells:
         columns = lines * (1 if scene.roll_width is None else 2 * scene.roll_width.slices)
-        product = 4 * grid.photographs * columns * cells
-        at_once = max(os.cpu_count() or 1, 200_000 // cells)  # parcels, see hpgr.solve
-        size += 3 * product + 40 * cells * min(columns * grid.photographs, at_once)  # kept, pooled, sorted; work space
-        seconds += grid.photographs * columns * cells * (0.28e-6 + 0.15e-9 * points)
-        frames = grid.photographs
+        product = 4 * grid.snapshots * columns * cells
+        at_once = max(os.cpu_count() or 1, 200_000 // cells)  # parcels, see hpgr.grains.solve
+        size += 3 * product + 40 * cells * min(columns * grid.snapshots, at_once)  # kept, pooled, sorted; work space
+        seconds += grid.snapshots * columns * cells * (0.28e-6 + 0.15e-9 * points)
+        frames = grid.snapshots
         if scene.exchange is not None:
             frames += -(-(points - 1) // scene.exchange.interval) if scene.exchange.record_startup else 0
             size += 17 * lines * points * cells + 30_000 * lines * points  # parcels; edges of the tessellation
-            steps = points + grid.photographs * scene.exchange.interval
+            steps = points + grid.snapshots * scene.exchange.interval
             seconds += 5e-5 * lines * points + steps * lines * points * (2e-6 + 1.5e-9 * cells)
         if grid.record == "cells":
             size += 4 * frames * lines * points * cells
@@ -119,5 +119,5 @@ def refuse_too_large(scene: Scene, room: tuple[int, str] | None = None) -> None:
             f"resolution.cells: got {scene.resolution.cells} cells x {scene.resolution.points} points x "
             f"{scene.resolution.streamlines} streamlines, recording {scene.resolution.record}: predicted "
             f"{needed:,} bytes, must be at most {_SHARE:.0%} of the {available:,} bytes that {limit} leaves; "
-            f"{spare}use fewer cells, points or photographs"
+            f"{spare}use fewer cells, points or snapshots"
         )

@@ -1,0 +1,149 @@
+"""Limits that a run may hit: one table of their names, bits, conditions and words."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from hpgr.bed.loaded import LoadedBed
+from hpgr.bed.machine import USUAL, Performance
+from hpgr.fields import show
+from hpgr.grains.solve import Crushed
+from hpgr.scene import Scene
+
+_NIPPING = 1.5  # top size over gap above which rolls nip single grains, which is not modelled
+
+
+class Run(NamedTuple):
+    """What a run is judged by."""
+
+    scene: Scene
+    bed: LoadedBed
+    performance: Performance
+    crushed: Crushed | None
+
+
+class Flag(NamedTuple):
+    """A limit.
+
+    Attributes
+    ----------
+    name : str
+        Its name.
+    bit : int
+        Its bit of the variable `flags`.
+    meaning : str
+        What it says of a run.
+    words : callable
+        Returns a sentence with the figures of a run that hit the limit, and nothing for one that did not.
+    """
+
+    name: str
+    bit: int
+    meaning: str
+    words: Callable[[Run], str]
+
+
+def diagnose(scene: Scene, bed: LoadedBed, performance: Performance, crushed: Crushed | None) -> dict[str, str]:
+    """Return, by flag, a sentence for each limit that a run hit."""
+    run = Run(scene, bed, performance, crushed)
+    told = ((flag.name, flag.words(run)) for flag in FLAGS)
+    return {name: words for name, words in told if words}
+
+
+def names(bits: int) -> list[str]:
+    """Return the names of the flags that are set in `bits`.
+
+    Examples
+    --------
+    >>> from hpgr.results import flags
+    >>> flags.names(5)
+    ['no_breakage', 'solid_fraction_capped']
+    """
+    return [name for name, bit in BITS.items() if bits & bit]
+
+
+def _unusual_machine(run: Run) -> str:
+    rolls = run.scene.rolls
+    values = {
+        "roll diameter": rolls.diameter,
+        "specific pressing force": run.performance.specific_pressing_force,
+        "specific energy": run.performance.specific_energy,
+        "gap over diameter": rolls.gap / rolls.diameter,
+        "exit solid fraction": float(run.bed.stress.solid_fraction[:, -1].mean()),
+    }
+    return "; ".join(
+        f"{name} {show(values[name], unit, 4)} (usual {show(low, unit)} to {show(high, unit)})"
+        for name, (low, high, unit) in USUAL.items()
+        if not low <= values[name] <= high
+    )
+
+
+def _no_compaction(run: Run) -> str:
+    if run.bed.stress.pressure.astype(np.float32).any():  # as it is stored: of less nothing would be seen
+        return ""
+    why = "the gap equals the entry gap" if run.bed.geometry.height == 0 else "the bed only dilates on its way to the gap"
+    return f"{why}: nothing is compacted nor pressed, the product is the feed"
+
+
+def _solid_fraction_capped(run: Run) -> str:
+    needed, most = float(run.bed.stress.continuity_solid_fraction.max()), run.scene.bed.max_solid_fraction
+    if needed <= most:
+        return ""
+    return f"mass continuity would need a solid fraction of {needed:.3g} at the exit; held at max_solid_fraction {most:g}"
+
+
+def _single_particle_nipping(run: Run) -> str:
+    gaps = run.scene.feed.largest_grain / run.scene.rolls.gap
+    if gaps <= _NIPPING:
+        return ""
+    return f"the feed's top size is {gaps:.3g} gaps; above {_NIPPING:g} the rolls nip single grains, which is not modelled"
+
+
+def _tension_clamped(run: Run) -> str:
+    words = "the elastic law asked for tension or reverse shear; stresses were held at 0 there"
+    return words if run.bed.stress.tension_clamped else ""
+
+
+def _no_limit_of_steps(run: Run) -> str:
+    exponent = run.scene.elasticity.exponent
+    if exponent >= 0 or not run.bed.stress.pressure.any():
+        return ""
+    return f"with elasticity.exponent {exponent:g}, below 0, stresses need not converge as time steps shrink"
+
+
+def _no_force_angle(run: Run) -> str:
+    words = "the bed takes more power than the force can give at any angle; force_angle is 90 deg"
+    return words if run.performance.force_angle >= np.pi / 2 else ""
+
+
+def _no_breakage(run: Run) -> str:
+    unbroken = run.crushed is not None and not run.crushed.breaks.any()
+    return "no grain broke: the product is the feed" if unbroken else ""
+
+
+def _size_floor_reached(run: Run) -> str:
+    if run.crushed is None or not run.crushed.below_floor.any():
+        return ""
+    return f"{run.crushed.below_floor.mean():.3g} of the product is below the size floor, where nothing breaks"
+
+
+def _few_cells(run: Run) -> str:
+    few = run.scene.resolution.cells in (2, 3)
+    return "with 2 or 3 cells every cell neighbours every other; use more" if few else ""
+
+
+FLAGS = (  # in the order in which they are told
+    Flag("no_compaction", 2, "nothing is compacted: the product is the feed", _no_compaction),
+    Flag("solid_fraction_capped", 4, "mass continuity would need a denser cake", _solid_fraction_capped),
+    Flag("single_particle_nipping", 8, f"the feed's top size is above {_NIPPING:g} gaps", _single_particle_nipping),
+    Flag("tension_clamped", 64, "the elastic law asked for tension or reverse shear", _tension_clamped),
+    Flag("no_limit_of_steps", 512, "stresses need not converge as time steps shrink", _no_limit_of_steps),
+    Flag("unusual_machine", 128, "machine or operation outside usual ranges", _unusual_machine),
+    Flag("no_force_angle", 256, "more power than the force can give at any angle", _no_force_angle),
+    Flag("no_breakage", 1, "no grain broke: the product is the feed", _no_breakage),
+    Flag("size_floor_reached", 16, "part of the product is below the size floor", _size_floor_reached),
+    Flag("few_cells", 32, "with 2 or 3 cells every cell neighbours every other", _few_cells),
+)
+BITS = {flag.name: flag.bit for flag in sorted(FLAGS, key=lambda flag: flag.bit)}
+ATTRIBUTES = {"flag_masks": np.array(list(BITS.values()), np.int32), "flag_meanings": " ".join(BITS)}
