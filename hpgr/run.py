@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from hpgr import cost
+from hpgr import __version__, cost
 from hpgr.bed import machine
 from hpgr.bed.loaded import Beds, LoadedBed, inputs_of, load_bed
 from hpgr.fields import check_seed
@@ -139,7 +139,7 @@ def simulate(
         scene, chosen = estimate.scene, estimate.variables()
     cost.refuse_too_large(scene)
     result = run_scene(scene, seed, replicate)
-    history = f"hpgr {schema.VERSION}: simulate(scene, seed={seed}, replicate={replicate})"
+    history = f"hpgr {__version__}: simulate(scene, seed={seed}, replicate={replicate})"
     title = "Comminution in high pressure grinding rolls, heterarchical model"
     return schema.to_dataset(result.values | chosen, attributes(result, title, seed, replicate) | {"history": history})
 

@@ -10,7 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hpgr import budget, pipeline, schema, solve
+from hpgr import cost
+from hpgr.bed.loaded import Beds
+from hpgr.grains import solve
+from hpgr.results import schema
+from hpgr.run import run_scene
 from hpgr.scene import Scene
 
 QUANTITIES = ("p80", "fineness", "peak_pressure")
@@ -58,7 +62,7 @@ def refine(scene: Scene, tolerance: float, max_cost: float = 60.0, seed: int = 0
     ----------
     scene : Scene
         What is simulated; its streamlines are the fewest taken, its points and cells are chosen anew. More than
-        one photograph makes the noise smaller than estimated.
+        one snapshot makes the noise smaller than estimated.
     tolerance : float
         Wanted relative error of P80, fraction below 1 mm and peak pressure; from 1e-4 to 0.5.
     max_cost : float
@@ -74,8 +78,8 @@ def refine(scene: Scene, tolerance: float, max_cost: float = 60.0, seed: int = 0
     if not 1e-4 <= tolerance <= 0.5:
         raise ValueError(f"tolerance: got {tolerance!r}; must be within 1e-4 to 0.5; such as tolerance=0.01")
     spent = _Purse(tolerance, max_cost)
-    kept = {f"resolution.{name}": getattr(scene.resolution, name) for name in ("record", "photographs")}
-    scene = scene.with_values({"resolution.photographs": 1})
+    kept = {f"resolution.{name}": getattr(scene.resolution, name) for name in ("record", "snapshots")}
+    scene = scene.with_values({"resolution.snapshots": 1})
     coarse, bias_lines = _enough_streamlines(scene, tolerance / 4, spent)
     coarse, bias_steps, scatter = _enough_points(coarse, tolerance / 2, spent, seed)
     bias = {name: bias_lines[name] + bias_steps[name] for name in bias_steps}
@@ -87,7 +91,7 @@ def refine(scene: Scene, tolerance: float, max_cost: float = 60.0, seed: int = 0
     chosen = coarse.with_values({"resolution.cells": cells, **kept})
     shrink = math.sqrt(coarse.resolution.cells / cells) if cells else 0.0
     noise = {name: _NOISE_SAFETY * scatter.get(name, 0.0) * shrink for name in bias}
-    spent.allow(budget.predict(chosen).seconds, chosen)
+    spent.allow(cost.predict(chosen).seconds, chosen)
     return Estimate(chosen, bias, noise)
 
 
@@ -141,9 +145,9 @@ def _enough_points(scene: Scene, wanted: float, spent: _Purse, seed: int):
             if max(sampling.values()) <= wanted:
                 return one, sampling, {}
         else:
-            spent.allow(_REPLICATES * budget.predict(one).seconds, one)
-            prepared = pipeline.prepare(one)
-            runs.append([_figures(one, seed, replicate, prepared) for replicate in range(_REPLICATES)])
+            spent.allow(_REPLICATES * cost.predict(one).seconds, one)
+            beds = Beds(1)
+            runs.append([_figures(one, seed, replicate, beds) for replicate in range(_REPLICATES)])
             steps = {name: _step(runs[-2], runs[-1], name) for name in ("p80", "fineness")} if len(runs) > 1 else None
             if earlier:
                 stepping = {name: _left(steps[name], earlier[name]) for name in steps}
@@ -167,11 +171,11 @@ def _smooth_figures(scene: Scene, streamlines: int, points: int, spent: _Purse) 
     The profile of stress across the gap and along the streamlines acts on both alike.
     """
     grid = {"resolution.streamlines": streamlines, "resolution.points": points, "resolution.record": "product"}
-    smooth = scene.with_values(grid | {"material.cushioning": math.inf, "exchange": None})
+    smooth = scene.with_values(grid | {"strength.cushioning": math.inf, "exchange": None})
     if solve.choose(smooth) == "march":  # strength without size effect has no closed form: judge the pressure
         smooth = smooth.with_values({"resolution.cells": 0})
     spent.allow(2.5e-3 + 2e-6 * streamlines * points, smooth)
-    return _figures(smooth, 0, 0, pipeline.prepare(smooth))
+    return _figures(smooth)
 
 
 def _step(coarse: list[dict], fine: list[dict], name: str) -> tuple[float, float]:
@@ -205,8 +209,8 @@ def relative(a: dict[str, float], b: dict[str, float], name: str) -> float:
     return (a[name] - b[name]) / scale
 
 
-def _figures(scene: Scene, seed: int, replicate: int, prepared: pipeline.Prepared) -> dict[str, float]:
-    return figures_of(pipeline.crush(scene, prepared, seed, replicate))
+def _figures(scene: Scene, seed: int = 0, replicate: int = 0, beds: Beds | None = None) -> dict[str, float]:
+    return figures_of(run_scene(scene, seed, replicate, beds).values)
 
 
 def figures_of(values: dict[str, Any]) -> dict[str, float]:

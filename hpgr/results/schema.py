@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
+from hpgr import __version__
 from hpgr.results import flags
 from hpgr.scene import field_info
 
@@ -183,7 +184,7 @@ def dataset_attributes(title: str, **more: Any) -> dict[str, Any]:
     return {
         "Conventions": "CF-1.11",
         "title": title,
-        "source": f"hpgr {_version('hpgr')}",
+        "source": f"hpgr {__version__}",
         "versions": ", ".join(f"{name} {_version(name)}" for name in _LIBRARIES),
     } | more
 
