@@ -14,8 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from hpgr import flow, machine, pipeline, solve, units
-from hpgr.scene import Feed, Scene, field_info
+from hpgr.bed import machine
+from hpgr.bed.loaded import Beds
+from hpgr.fields import show
+from hpgr.grains import solve
+from hpgr.laws.feed import Feed, TableFeed
+from hpgr.run import load, run_scene
+from hpgr.scene import Scene, field_info
 from hpgr.tables import PilotTest, read_pilot_tests
 
 _PARTS, _MEASURED = ("centre", "edge", "total"), ("throughput", "power", "cake_thickness")
@@ -63,11 +68,11 @@ class Parameter(NamedTuple):
 
 
 PARAMETERS = {
-    "sigma_m": Parameter("material.strength", 1e3, 1e10),
-    "w": Parameter("material.weibull_modulus", 0.05, 100.0),
-    "gamma": Parameter("material.fragment_exponent", 0.02, 20.0),
-    "n": Parameter("material.cushioning", 0.05, 100.0),
-    "K": Parameter("material.bulk_modulus", 1e5, 1e12, follower="material.shear_modulus"),
+    "sigma_m": Parameter("strength.reference_strength", 1e3, 1e10),
+    "w": Parameter("strength.weibull_modulus", 0.05, 100.0),
+    "gamma": Parameter("fragments.exponent", 0.02, 20.0),
+    "n": Parameter("strength.cushioning", 0.05, 100.0),
+    "K": Parameter("elasticity.bulk_modulus", 1e5, 1e12, follower="elasticity.shear_modulus"),
     "alpha": Parameter("flow.nip_angle", math.radians(1), math.radians(45)),
     "kappa": Parameter("roll_width.pressure_drop", 0.0, 1.0, logarithmic=False),
     "T_0": Parameter("rolls.idle_torque", 0.0, 1e6, logarithmic=False),
@@ -129,7 +134,7 @@ class Calibration(NamedTuple):
     def __str__(self) -> str:
         lines = [f"calibrated on {', '.join(self.residuals)}"]
         for name, found in self.estimates.items():
-            value, low, high = (units.show(one, found.unit) for one in found[:3])
+            value, low, high = (show(one, found.unit) for one in found[:3])
             spread = f"{low} to {high}" if math.isfinite(found.high) else "any value"
             told = " (at its bound)" if name in self.at_bound else ""
             lines.append(f"{name:>8} = {value} ({spread}){told}")
@@ -151,7 +156,7 @@ def calibrate(
     Parameters
     ----------
     scene : Scene
-        Machine, ore and resolution to start from. With profile "nip" it needs a nip angle or a cake density, and with
+        Machine, ore and resolution to start from. With flow "nip" it needs a nip angle or a cake density, and with
         `roll_width` centre and edge of the width are told apart.
     feed : Feed, optional
         Feed of all tests; default each test's own.
@@ -179,7 +184,7 @@ def calibrate(
     --------
     >>> import hpgr
     >>> folder = hpgr.presets.DATA
-    >>> coarse = {"resolution.points": 40, "resolution.streamlines": 1, "material.cushioning": float("inf")}
+    >>> coarse = {"resolution.points": 40, "resolution.streamlines": 1, "strength.cushioning": float("inf")}
     >>> scene = hpgr.presets.khd_pilot().with_values(coarse)
     >>> product, operations = folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv"
     >>> found = hpgr.calibrate(scene, None, product, operations, fit=["sigma_m", "gamma"], tests=["K-P1"])
@@ -205,7 +210,7 @@ def fit_tests(scene: Scene, tests: Sequence[PilotTest], fit: Sequence[str], feed
     >>> from hpgr.tables import read_pilot_tests
     >>> folder = hpgr.presets.DATA
     >>> tests = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
-    >>> coarse = {"resolution.points": 40, "resolution.streamlines": 1, "material.cushioning": float("inf")}
+    >>> coarse = {"resolution.points": 40, "resolution.streamlines": 1, "strength.cushioning": float("inf")}
     >>> scene = hpgr.presets.khd_pilot().with_values(coarse)
     >>> found = calibration.fit_tests(scene, tests[:1], ["gamma"])
     >>> found.estimates["gamma"].low < found.estimates["gamma"].value < found.estimates["gamma"].high
@@ -241,7 +246,7 @@ class _Trial:
 
     def __init__(self, scene: Scene, cases: list[Scene], tests: Sequence[PilotTest], names: list[str]):
         self.scene, self.cases, self.tests, self.names = scene, cases, tests, names
-        self._beds: dict[tuple, tuple[Scene, pipeline.Prepared]] = {}
+        self._beds = Beds(_BEDS)
 
     def machine(self, place: np.ndarray) -> np.ndarray:
         """Return by how many percent throughput, power and cake thickness are missed."""
@@ -253,7 +258,7 @@ class _Trial:
 
     def smooth_product(self, place: np.ndarray) -> np.ndarray:
         """Return the same without cushioning, by the closed form."""
-        return self._missed(place, _PARTS, {"material.cushioning": math.inf})
+        return self._missed(place, _PARTS, {"strength.cushioning": math.inf})
 
     def refuse_unfit(self, place: np.ndarray, machine_part: list[int], product_part: list[int]) -> None:
         """Raise ValueError if there is too little to fit to, or no gap carries the forces to begin with."""
@@ -270,12 +275,10 @@ class _Trial:
             if (found == _LOST).any():
                 raise ValueError(
                     "scene: no gap carries the force of every test with the moduli and nip angle that the fit begins "
-                    "with; one must; give another material.bulk_modulus, such as '600 MPa', or flow.nip_angle"
+                    "with; one must; give another elasticity.bulk_modulus, such as '600 MPa', or flow.nip_angle"
                 )
 
     def _missed(self, place: np.ndarray, names: Sequence[str], extra: dict[str, Any]) -> np.ndarray:
-        if len(self._beds) > _BEDS:
-            self._beds.clear()
         values = _values(self.scene, self.names, place) | extra
         parts = [self._of_test(case, test, values, names) for case, test in zip(self.cases, self.tests, strict=True)]
         return np.concatenate(parts)
@@ -321,30 +324,23 @@ def _at_test(scene: Scene, test: PilotTest, feed: Feed | None, floating: bool = 
     values: dict[str, Any] = {
         "rolls.speed": test.surface_speed / (scene.rolls.diameter / 2),
         "rolls.specific_pressing_force": test.specific_pressing_force if floating else None,
-        "feed": feed or Feed(kind="table", table=[row for row, here in zip(table, known, strict=True) if here]),
+        "feed": feed or TableFeed(table=[row for row, here in zip(table, known, strict=True) if here]),
         "resolution.sieves": tuple(test.sizes.tolist()),
     }
-    if scene.flow.cake_solid_fraction is not None:  # the angle is the ore's; it is held while the gap floats
-        values |= {"flow.nip_angle": flow.nip_angle(scene), "flow.cake_solid_fraction": None}
+    if getattr(scene.flow, "cake_solid_fraction", None) is not None:  # the angle is the ore's; it is held while the gap floats
+        values |= {"flow.nip_angle": _nip_angle(scene), "flow.cake_solid_fraction": None}
     if not floating:
         values["rolls.gap"] = test.gap if math.isnan(test.cake_thickness) else test.cake_thickness
     return scene.with_values(values)
 
 
-def _predict(scene: Scene, beds: dict[tuple, tuple[Scene, pipeline.Prepared]] | None = None) -> Prediction:
+def _predict(scene: Scene, beds: Beds | None = None) -> Prediction:
     """Predict; `beds` keeps the loaded beds of trials, which those of another strength share (2 x faster)."""
-    beds = {} if beds is None else beds
-    key = (*pipeline.bed_key(scene), scene.roll_width)
-    if key not in beds:
-        held = machine.at_operating_gap(scene)
-        beds[key] = held, pipeline.prepare(held)
-    held, prepared = beds[key]
-    scene = scene.model_copy(update={"rolls": held.rolls, "flow": held.flow})
-    values = pipeline.crush(scene, prepared, 0, 0)
+    found = run_scene(scene, beds=beds)
     names = ("passing_width_centre", "passing_width_edge", "passing_total")
-    products = [None if values.get(name) is None else np.asarray(values[name]) for name in names]
-    figures = (float(values[name]) for name in ("throughput", "power", "specific_energy"))
-    return Prediction(scene.rolls.gap, *figures, *products)
+    products = [None if found.values.get(name) is None else np.asarray(found.values[name]) for name in names]
+    figures = (float(found.values[name]) for name in ("throughput", "power", "specific_energy"))
+    return Prediction(found.scene.rolls.gap, *figures, *products)
 
 
 def _residuals(found: Prediction, test: PilotTest) -> dict[str, np.ndarray]:
@@ -367,26 +363,26 @@ def _started(scene: Scene, names: Sequence[str], test: PilotTest, feed: Feed | N
     if math.isnan(cake):
         return scene
     if "alpha" in names and not math.isnan(test.throughput):
-        rolls, ore = scene.rolls, scene.material
-        solid = test.throughput / (ore.solid_density * cake * rolls.width * test.surface_speed)
-        if ore.feed_solid_fraction < solid <= ore.max_solid_fraction:  # else the working gap was no cake's thickness
+        bed = scene.bed
+        solid = test.throughput / (bed.solid_density * cake * scene.rolls.width * test.surface_speed)
+        if bed.feed_solid_fraction < solid <= bed.max_solid_fraction:  # else the working gap was no cake's thickness
             values = {"rolls.gap": cake, "flow.cake_solid_fraction": solid, "flow.nip_angle": None}
-            angle = flow.nip_angle(scene.with_values(values | {"rolls.specific_pressing_force": 1.0}))
+            angle = _nip_angle(scene.with_values(values | {"rolls.specific_pressing_force": 1.0}))
             scene = scene.with_values({"flow.nip_angle": angle, "flow.cake_solid_fraction": None})
     here = _at_test(scene, test, feed, floating=False).with_values({"resolution.cells": 0})
     if "K" in names:
-        force = machine.pressing_force(here)  # proportional to the moduli
+        force = machine.specific_pressing_force(here)  # proportional to the moduli
         if force > 0:
             factor = test.specific_pressing_force / force
-            stiffer = {f"material.{name}": factor * getattr(scene.material, name) for name in _MODULI}
+            stiffer = {f"elasticity.{name}": factor * getattr(scene.elasticity, name) for name in _MODULI}
             scene, here = scene.with_values(stiffer), here.with_values(stiffer)
     if "sigma_m" in names:
-        pressure = float(pipeline.prepare(here).crushing.max())
+        pressure = float(solve.crushing_stress(*load(here)).max())
         critical = float(np.interp(_CRITICAL, test.total, test.sizes))
-        slope = 3 / scene.material.weibull_modulus
+        slope = 3 / scene.strength.weibull_modulus
         if pressure > 0:
-            strength = pressure * (critical / scene.material.strength_size) ** slope
-            scene = scene.with_values({"material.strength": min(max(strength, 1e4), 1e9)})
+            strength = pressure * (critical / scene.strength.reference_size) ** slope
+            scene = scene.with_values({"strength.reference_strength": min(max(strength, 1e4), 1e9)})
     return scene
 
 
@@ -484,17 +480,21 @@ def _known_names(scene: Scene, fit: Sequence[str]) -> list[str]:
     if unknown or not names:
         told = ", ".join(unknown) or "nothing"
         raise ValueError(f"fit: got {told}; must be among {', '.join(PARAMETERS)}; correct the symbols, or name some")
-    if "alpha" in names and scene.flow.profile != "nip":
-        raise ValueError("fit: got alpha; must be fitted with flow.profile = 'nip'; leave it out or take that profile")
+    if "alpha" in names and scene.flow.kind != "nip":
+        raise ValueError("fit: got alpha; must be fitted with flow.kind = 'nip'; leave it out or take that flow")
     if "kappa" in names and scene.roll_width is None:
         raise ValueError("fit: got kappa; must be fitted with a roll_width; leave it out or give the scene one")
     return names
 
 
+def _nip_angle(scene: Scene) -> float:
+    return scene.flow.angle(scene.rolls.gap, scene.rolls.diameter, scene.bed.feed_solid_fraction)
+
+
 def _value_of(scene: Scene, name: str) -> float:
     """Return the value to start from."""
     if name == "alpha":
-        return flow.nip_angle(scene)
+        return _nip_angle(scene)
     part, key = PARAMETERS[name].field.split(".")
     value = getattr(getattr(scene, part), key)
     return min(max(value, PARAMETERS[name].low), PARAMETERS[name].high if name != "n" else 1.0)

@@ -149,6 +149,7 @@ def attributes(result: Result, title: str, seed: int, replicate: int) -> dict[st
     return schema.dataset_attributes(
         title,
         scene=result.scene.model_dump_json(),
+        level=result.scene.resolution.level(),
         seed=int(seed),
         replicate=int(replicate),
         solver=result.solver,

@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, ValidationError
 
 from hpgr.fields import (
     Count,
@@ -453,7 +453,9 @@ def _feed_faults(known: dict[str, Any]) -> Iterator[Fault]:
     for name in ("bottom_size", "top_size", "size"):
         size = known.get(f"feed.{name}")
         if size is not None and size > entry_gap:
-            yield Fault(f"feed.{name}", show(size, "m"), bound, "crush or scalp the feed first, or begin the bed higher")
+            yield Fault(
+                f"feed.{name}", show(size, "m"), bound, "crush or scalp the feed first, or begin the bed higher"
+            )
     largest = next((size for size, percent in known.get("feed.table") or () if percent >= 100), 0.0)
     if known.get("feed.top_size") is None and largest > entry_gap:
         got = f"largest grain {show(largest, 'm')}"

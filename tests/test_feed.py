@@ -6,16 +6,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import draw, sized
 
-from hpgr import Feed, feed
+from hpgr.laws import feed as feeds
 
 TABLE = ((0.001, 10.0), (0.002, 30.0), (0.004, 30.0), (0.008, 100.0))
 FEEDS = {
-    "uniform": Feed(kind="uniform", bottom_size=0.008, top_size=0.06),
-    "from zero": Feed(kind="uniform", bottom_size=0.0, top_size=0.06),
-    "power law": Feed(kind="power_law", top_size=0.06, exponent=0.7),
-    "rosin-rammler": Feed(kind="rosin_rammler", size=0.02, exponent=1.3, top_size=0.06),
-    "table": Feed(kind="table", table=TABLE),
-    "scalped": Feed(kind="table", table=TABLE, top_size=0.006),
+    "uniform": feeds.UniformFeed(bottom_size=0.008, top_size=0.06),
+    "from zero": feeds.UniformFeed(bottom_size=0.0, top_size=0.06),
+    "power law": feeds.PowerLawFeed(top_size=0.06, exponent=0.7),
+    "rosin-rammler": feeds.RosinRammlerFeed(size=0.02, exponent=1.3, top_size=0.06),
+    "table": feeds.TableFeed(table=TABLE),
+    "scalped": feeds.TableFeed(table=TABLE, top_size=0.006),
 }
 each = pytest.mark.parametrize("given_feed", FEEDS.values(), ids=FEEDS)
 
@@ -23,56 +23,56 @@ each = pytest.mark.parametrize("given_feed", FEEDS.values(), ids=FEEDS)
 @each
 @given(st.floats(1e-6, 1 - 1e-6))
 def test_passing_inverts_quantile(given_feed, fraction):
-    assert feed.passing(given_feed, feed.quantile(given_feed, fraction)) == pytest.approx(fraction, rel=1e-9)
+    assert given_feed.passing(given_feed.quantile(fraction)) == pytest.approx(fraction, rel=1e-9)
 
 
 @each
 @given(st.floats(0.0, 1.0))
 def test_quantile_inverts_passing(given_feed, place):
-    low, high = feed.quantile(given_feed, 1e-9), given_feed.coarsest
+    low, high = given_feed.quantile(1e-9), given_feed.largest_grain
     size = low * (high / low) ** place
-    fraction = float(feed.passing(given_feed, size))
+    fraction = float(given_feed.passing(size))
     if fraction in (0.0, 1.0) or 0.002 <= size <= 0.004:  # flat there: no inverse
         return
-    assert feed.quantile(given_feed, fraction) == pytest.approx(size, rel=1e-7)
+    assert given_feed.quantile(fraction) == pytest.approx(size, rel=1e-7)
 
 
 @each
 def test_passing_rises_from_0_to_1_at_the_top_size(given_feed):
     sizes = np.geomspace(1e-9, 1, 2001)
-    found = feed.passing(given_feed, sizes)
+    found = given_feed.passing(sizes)
     assert np.all(np.diff(found) >= 0)
     assert found[0] < 1e-4
-    assert np.all(found[sizes >= given_feed.coarsest] == 1.0)
-    assert feed.passing(given_feed, 0.999 * given_feed.coarsest) < 1
-    assert feed.passing(given_feed, math.inf) == 1.0
-    assert feed.passing(given_feed, 0.0) == 0.0
+    assert np.all(found[sizes >= given_feed.largest_grain] == 1.0)
+    assert given_feed.passing(0.999 * given_feed.largest_grain) < 1
+    assert given_feed.passing(math.inf) == 1.0
+    assert given_feed.passing(0.0) == 0.0
 
 
 def test_known_values():
-    assert feed.passing(FEEDS["uniform"], 0.034) == pytest.approx(0.5, rel=1e-14)
-    assert feed.quantile(FEEDS["uniform"], [0, 1]) == pytest.approx([0.008, 0.06], rel=1e-15)
-    assert feed.passing(FEEDS["power law"], 0.03) == pytest.approx(0.5**0.7, rel=1e-14)
+    assert FEEDS["uniform"].passing(0.034) == pytest.approx(0.5, rel=1e-14)
+    assert FEEDS["uniform"].quantile([0, 1]) == pytest.approx([0.008, 0.06], rel=1e-15)
+    assert FEEDS["power law"].passing(0.03) == pytest.approx(0.5**0.7, rel=1e-14)
     rest = 1 - math.exp(-(3.0**1.3))
-    assert feed.passing(FEEDS["rosin-rammler"], 0.02) == pytest.approx((1 - 1 / math.e) / rest, rel=1e-14)
-    assert feed.passing(FEEDS["table"], [0.001, 0.002, 0.003, 0.008]) == pytest.approx([0.1, 0.3, 0.3, 1.0], rel=1e-14)
+    assert FEEDS["rosin-rammler"].passing(0.02) == pytest.approx((1 - 1 / math.e) / rest, rel=1e-14)
+    assert FEEDS["table"].passing([0.001, 0.002, 0.003, 0.008]) == pytest.approx([0.1, 0.3, 0.3, 1.0], rel=1e-14)
     # linear in log size: half way between 1 and 2 mm is their geometric mean
-    assert feed.passing(FEEDS["table"], 0.001 * math.sqrt(2)) == pytest.approx(0.2, rel=1e-14)
+    assert FEEDS["table"].passing(0.001 * math.sqrt(2)) == pytest.approx(0.2, rel=1e-14)
 
 
 def test_single_size_steps_at_its_size():
-    single = Feed(kind="single", size=0.02)
-    assert list(feed.passing(single, [0.0199, 0.02, 0.0201])) == [0, 1, 1]
-    assert np.all(feed.quantile(single, [0.0, 0.3, 1.0]) == 0.02)
-    assert single.coarsest == 0.02
+    single = feeds.SingleFeed(size=0.02)
+    assert list(single.passing([0.0199, 0.02, 0.0201])) == [0, 1, 1]
+    assert np.all(single.quantile([0.0, 0.3, 1.0]) == 0.02)
+    assert single.largest_grain == 0.02
 
 
 def test_table_is_extended_to_zero_along_its_first_slope():
     # 20 % per factor 2: the 10 % below 1 mm end at 1 mm / sqrt(2)
-    assert feed.quantile(FEEDS["table"], 0.0) == pytest.approx(0.001 / math.sqrt(2), rel=1e-12)
-    assert feed.passing(FEEDS["table"], 0.0007) == 0.0
-    to_zero = Feed(kind="table", table=((0.001, 0.0), (0.008, 100.0)))
-    assert feed.quantile(to_zero, 0.0) == pytest.approx(0.001, rel=1e-12)
+    assert FEEDS["table"].quantile(0.0) == pytest.approx(0.001 / math.sqrt(2), rel=1e-12)
+    assert FEEDS["table"].passing(0.0007) == 0.0
+    to_zero = feeds.TableFeed(table=((0.001, 0.0), (0.008, 100.0)))
+    assert to_zero.quantile(0.0) == pytest.approx(0.001, rel=1e-12)
 
 
 def test_sieves_without_mass_hold_no_grains():
@@ -82,18 +82,18 @@ def test_sieves_without_mass_hold_no_grains():
 
 def test_scalping_removes_what_is_coarser_and_rescales_the_rest():
     whole, scalped = FEEDS["table"], FEEDS["scalped"]
-    left = float(feed.passing(whole, 0.006))
+    left = float(whole.passing(0.006))
     sizes = np.array([0.0008, 0.0015, 0.005])
-    assert feed.passing(scalped, sizes) == pytest.approx(feed.passing(whole, sizes) / left, rel=1e-14)
-    assert feed.quantile(scalped, 1.0) == pytest.approx(0.006, rel=1e-12)
-    assert scalped.coarsest == 0.006
+    assert scalped.passing(sizes) == pytest.approx(whole.passing(sizes) / left, rel=1e-14)
+    assert scalped.quantile(1.0) == pytest.approx(0.006, rel=1e-12)
+    assert scalped.largest_grain == 0.006
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
 @each
 def test_shapes_are_kept(given_feed, shape):
-    assert np.shape(feed.passing(given_feed, np.full(shape, 0.005))) == shape
-    assert np.shape(feed.quantile(given_feed, np.full(shape, 0.5))) == shape
+    assert np.shape(given_feed.passing(np.full(shape, 0.005))) == shape
+    assert np.shape(given_feed.quantile(np.full(shape, 0.5))) == shape
 
 
 @each
@@ -103,7 +103,7 @@ def test_draw_is_stratified(given_feed, cells):
     drawn = draw(given_feed, cells, np.random.SeedSequence(7))
     assert drawn.dtype == np.float32
     ordered = np.sort(drawn.astype(float))
-    exact = feed.passing(given_feed, ordered)
+    exact = given_feed.passing(ordered)
     count = np.arange(cells + 1) / cells
     slack = 1 / cells + 1e-5  # rounding of a size to float32 moves its passing by less than 1e-5
     assert np.max(np.abs(exact - count[1:])) <= slack
@@ -123,31 +123,31 @@ def test_draw_order_is_random_and_follows_the_source():
 def test_drawn_sizes_lie_within_the_feed(given_feed):
     drawn = draw(given_feed, 1000, np.random.SeedSequence(3))
     assert np.all(drawn > 0)
-    assert np.all(drawn <= np.float32(given_feed.coarsest))
+    assert np.all(drawn <= np.float32(given_feed.largest_grain))
 
 
 @pytest.mark.parametrize(
     "given_feed",
     [
-        Feed(kind="rosin_rammler", size=0.01, exponent=1.0, top_size=1.0),
-        Feed(kind="table", table=TABLE, top_size=0.003),  # scalped where the table is flat
+        feeds.RosinRammlerFeed(size=0.01, exponent=1.0, top_size=1.0),
+        feeds.TableFeed(table=TABLE, top_size=0.003),  # scalped where the table is flat
     ],
     ids=["rosin-rammler far below its top", "scalped on a flat part"],
 )
 def test_no_quantile_is_above_the_top_size(given_feed):
-    assert float(feed.quantile(given_feed, 1.0)) <= given_feed.coarsest * (1 + 1e-9)
+    assert float(given_feed.quantile(1.0)) <= given_feed.largest_grain * (1 + 1e-9)
 
 
-def test_coarsest_is_the_finest_sieve_that_passes_everything():
+def test_largest_grain_is_the_finest_sieve_that_passes_everything():
     """A laboratory's table may hold several sieves that pass 100 %; no grain is as coarse as the coarsest of them."""
-    table = Feed(kind="table", table=((0.001, 0.0), (0.002, 50.0), (0.004, 100.0), (0.008, 100.0)))
-    assert table.coarsest == 0.004
-    assert feed.quantile(table, 1.0) == pytest.approx(0.004, rel=1e-12)
+    table = feeds.TableFeed(table=((0.001, 0.0), (0.002, 50.0), (0.004, 100.0), (0.008, 100.0)))
+    assert table.largest_grain == 0.004
+    assert table.quantile(1.0) == pytest.approx(0.004, rel=1e-12)
 
 
 def test_scalping_below_all_mass_is_refused():
     with pytest.raises(ValueError, match="top_size"):
-        Feed(kind="table", table=((0.001, 0.0), (0.002, 0.0), (0.004, 100.0)), top_size=0.0015)
+        feeds.TableFeed(table=((0.001, 0.0), (0.002, 0.0), (0.004, 100.0)), top_size=0.0015)
 
 
 BAD = {
@@ -165,12 +165,12 @@ BAD = {
 @pytest.mark.parametrize(("table", "words"), BAD.values(), ids=BAD)
 def test_bad_tables_are_refused_naming_the_row(table, words):
     with pytest.raises(ValueError, match=words):
-        Feed(kind="table", table=table)
+        feeds.TableFeed(table=table)
 
 
 def test_every_bad_row_is_named_at_once():
     with pytest.raises(ValueError, match="row 2") as error:
-        Feed(kind="table", table=((0.001, 0.0), (0.0005, -5.0), (0.003, 120.0), (0.004, 90.0)))
+        feeds.TableFeed(table=((0.001, 0.0), (0.0005, -5.0), (0.003, 120.0), (0.004, 90.0)))
     for row in ("row 2 (0.5 mm, -5 %)", "row 3 (3 mm, 120 %)", "row 4 (4 mm, 90 %)", "row 4 (90 %)"):
         assert row in str(error.value)
 
@@ -178,11 +178,11 @@ def test_every_bad_row_is_named_at_once():
 def test_scalping_outside_the_table_is_refused():
     for top in (0.0009, 0.009):
         with pytest.raises(ValueError, match="must lie within the table, above 1 mm to 8 mm"):
-            Feed(kind="table", table=TABLE, top_size=top)
+            feeds.TableFeed(table=TABLE, top_size=top)
 
 
 def test_a_steep_rosin_rammler_feed_far_finer_than_its_top_overflows_in_silence():
     """(s / size) ** exponent is inf there, and all of it passes."""
-    steep = Feed(kind="rosin_rammler", size=1e-5, exponent=100.0, top_size=0.04)
-    assert feed.passing(steep, [0.0, 0.04]).tolist() == [0.0, 1.0]
-    assert feed.quantile(steep, [0.5]) == pytest.approx(1e-5 * math.log(2) ** 0.01, rel=1e-12)
+    steep = feeds.RosinRammlerFeed(size=1e-5, exponent=100.0, top_size=0.04)
+    assert steep.passing([0.0, 0.04]).tolist() == [0.0, 1.0]
+    assert steep.quantile([0.5]) == pytest.approx(1e-5 * math.log(2) ** 0.01, rel=1e-12)

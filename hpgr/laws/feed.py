@@ -246,6 +246,4 @@ def _ends_below(first: tuple[float, float], second: tuple[float, float]) -> bool
     return slope > 0 and size * math.exp(-min(percent / slope, 700.0)) >= 1e-9
 
 
-Feed = Annotated[
-    UniformFeed | SingleFeed | PowerLawFeed | RosinRammlerFeed | TableFeed, Field(discriminator="kind")
-]
+Feed = Annotated[UniformFeed | SingleFeed | PowerLawFeed | RosinRammlerFeed | TableFeed, Field(discriminator="kind")]

@@ -1,0 +1,94 @@
+import contextlib
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hpgr.fields import UNITS, check_seed, parse, show
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "value"),
+    [
+        ("60 mm", "m", 0.06),
+        ("1 um", "m", 1e-6),
+        ("2.5in", "m", 0.0635),
+        ("0.84 MPa", "Pa", 0.84e6),
+        ("19 rpm", "rad s-1", 19 * 2 * math.pi / 60),
+        ("2 rad/s", "rad s-1", 2.0),
+        ("2.65 g/cm^3", "kg m-3", 2650.0),
+    ],
+)
+def test_text_with_a_unit_becomes_si(text, unit, value):
+    assert parse(text, unit) == pytest.approx(value, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("60", "text without a unit; write it as '60 mm'"),
+        ("3 s", "not a quantity in mm: its unit 's' measures something else"),
+        ("20 degC", "not a quantity in mm"),
+        ("60 mmm", "its unit 'mmm' is not known"),
+        ("60/0 mm", "not a number and a unit; write it like '60 mm'"),
+        ("60 mm # gap", "not a number and a unit"),
+        ("[60] mm", "not a number and a unit"),
+        ("60 mm)", "not a number and a unit"),
+        ("60 mm + 1 m", "not a number and a unit"),
+        ("mm", "not a number and a unit"),
+        ("", "not a number and a unit"),
+        ("lambda: 1", "not a number and a unit"),
+    ],
+)
+def test_text_is_one_number_and_one_unit(text, words):
+    with pytest.raises(ValueError) as error:  # noqa: PT011
+        parse(text, "m")
+    assert words in str(error.value)
+
+
+@given(st.text(alphabet="0123456789.e+- mMPax/()[]{}'\"#\\\n;:,µ²", max_size=12))
+def test_any_text_gives_a_number_or_a_value_error(text):
+    if "**" in text:
+        return
+    with contextlib.suppress(ValueError):
+        assert isinstance(parse(text, "m"), float)
+
+
+@given(st.floats(1e-9, 1e9))
+def test_shown_values_are_read_back(value):
+    for unit in ("m", "Pa", "rad s-1", "rad", "N m"):
+        assert parse(show(value, unit), unit) == pytest.approx(value, rel=1e-5)
+
+
+@pytest.mark.parametrize("text", ["1 Hz", "1 1/s", "0.67 m/s"])
+def test_roll_speed_is_a_rate_of_turning(text):
+    # 1 Hz would be read as 1 rad/s, a sixth of the turn per second that its writer means
+    with pytest.raises(ValueError, match="19 rpm"):
+        parse(text, "rad s-1")
+
+
+def test_values_are_shown_in_the_unit_people_use():
+    assert show(0.06, "m") == "60 mm"
+    assert show(2 * math.pi, "rad s-1") == "60 rpm"
+    assert show(10.0, "kg s-1") == "36 t/h"
+    assert show(0.5, "1") == "0.5"
+    assert show(2650.0, "kg m-3") == "2650 kg m-3"
+    assert show(math.inf, "m") == "inf mm"
+
+
+def test_examples_of_units_are_read():
+    for unit, entry in UNITS.items():
+        if entry.example:
+            assert parse(entry.example, unit) > 0
+
+
+@pytest.mark.parametrize("value", [-1, 1.0, 1.5, True, 2**63, "0", None])
+def test_seeds_are_whole_numbers_that_a_file_can_hold(value):
+    with pytest.raises(ValueError, match="seed: got .*; must be a whole number from 0 to"):
+        check_seed("seed", value)
+
+
+def test_good_seeds_pass():
+    for value in (0, 2**63 - 1):
+        check_seed("seed", value)
