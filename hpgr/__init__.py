@@ -51,15 +51,16 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name == "presets":
-        return import_module("hpgr.presets")
-    if name not in _HOMES:
-        raise AttributeError(f"module 'hpgr' has no attribute {name!r}")
-    value = getattr(import_module(f"hpgr.{_HOMES[name]}"), name)
-    globals()[name] = value
-    return value
+if not TYPE_CHECKING:  # or a type checker would take every name for an existing one
 
+    def __getattr__(name: str) -> Any:
+        if name == "presets":
+            return import_module("hpgr.presets")
+        if name not in _HOMES:
+            raise AttributeError(f"module 'hpgr' has no attribute {name!r}")
+        value = getattr(import_module(f"hpgr.{_HOMES[name]}"), name)
+        globals()[name] = value
+        return value
 
-def __dir__() -> list[str]:
-    return sorted(__all__)
+    def __dir__() -> list[str]:
+        return sorted(__all__)

@@ -280,9 +280,14 @@ class Resolution(Frozen):
         return "custom"
 
 
+def _level(value: Any) -> Level | None:
+    """Return the level that `value` names, if it names one."""
+    return levels().get(value) if isinstance(value, str) else None
+
+
 def _of_level(value: Any) -> Any:
     """Return the values of a level given by its name; anything else as it is."""
-    level = levels().get(value) if isinstance(value, str) else None
+    level = _level(value)
     return value if level is None else level.values()
 
 
@@ -389,7 +394,8 @@ class Scene(Frozen):
     def with_values(self, values: Mapping[str, Any]) -> Self:
         """Return the scene with other values, given by dotted name, validated as a whole.
 
-        A name without a dot replaces a whole part: ``{"exchange": None}``, ``{"exchange": {}}`` for its defaults.
+        A name without a dot replaces a whole part: ``{"exchange": None}``, ``{"exchange": {}}`` for its defaults. The
+        name of a level, ``{"resolution": "fine"}``, sets streamlines, points and cells alone.
         Another kind of law drops the values of fields that it has not.
 
         Examples
@@ -404,6 +410,10 @@ class Scene(Frozen):
             If a name is unknown, or the scene is impossible with these values.
         """
         data: dict[str, Any] = dict(self)  # parts left alone stay models, which are not validated again
+        data |= {name: whole for name, whole in values.items() if "." not in name}
+        level = _level(data["resolution"])
+        if level is not None:  # what is kept of the results stays
+            data["resolution"] = dict(self.resolution) | level.values()
         for name in {name.partition(".")[0] for name in values if "." in name}:
             data[name] = dict(data.get(name) or {})
             kind = values.get(f"{name}.kind")
@@ -414,8 +424,6 @@ class Scene(Frozen):
             section, _, key = name.partition(".")
             if key:
                 data[section][key] = value
-            else:
-                data[section] = value
         return type(self).model_validate(data)
 
     def __repr__(self) -> str:

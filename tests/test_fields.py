@@ -85,7 +85,7 @@ def test_examples_of_units_are_read():
 
 @pytest.mark.parametrize("value", [-1, 1.0, 1.5, True, 2**63, "0", None])
 def test_seeds_are_whole_numbers_that_a_file_can_hold(value):
-    with pytest.raises(ValueError, match="seed: got .*; must be a whole number from 0 to"):
+    with pytest.raises(ValueError, match=r"seed: got .*; must be a whole number from 0 to"):
         check_seed("seed", value)
 
 

@@ -358,8 +358,12 @@ def test_scenes_are_frozen_and_equal_by_value():
 
 def test_named_resolutions():
     assert set(levels()) == {"draft", "standard", "fine"}
-    fine = paper({"resolution": "fine"})
-    assert (fine.resolution.points, fine.resolution.record) == (800, "cells")
+    exchange = {}
+    fine = paper({"resolution.record": "product"}).with_values(
+        {"resolution": "fine", "resolution.cells": 32_000, "exchange": exchange, "exchange.mixing": 0}
+    )
+    assert (fine.resolution.points, fine.resolution.record) == (800, "product")
+    assert (fine.exchange.mixing, exchange) == (0, {})
     assert fine.resolution.level().startswith("fine: P50, P80")
     assert paper().resolution.level() == "custom"
     with pytest.raises(ValidationError, match="resolution\n  got 'finest'"):

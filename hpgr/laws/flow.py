@@ -6,7 +6,7 @@ compiled bed (hpgr/bed/kernels.py) takes speed, travel time and strain rates.
 
 import math
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field
@@ -36,6 +36,18 @@ class _Profile(Frozen):
         lt=1,
     )
 
+    def held(self, gap: float, diameter: float, feed_solid_fraction: float) -> Self:
+        """Return the profile with what is held while the gap floats; by default nothing."""
+        return self
+
+    def narrowest_gap(self, diameter: float, feed_solid_fraction: float) -> tuple[float, str]:
+        """Return the gap to which the held profile reaches down, m, and what is below it; by default any gap is."""
+        return 0.0, ""
+
+    def widest_gap(self, diameter: float, entry_gap: float) -> float:
+        """Return the largest gap at which the held profile leaves a bed, m."""
+        return entry_gap * (1 - 1e-9)
+
 
 class PowerFlow(_Profile):
     """Speed |v| = U (1 - y/H)**exponent on every streamline (the paper's; m = 1 is its linear law).
@@ -58,18 +70,6 @@ class PowerFlow(_Profile):
     def vertical_speed(self, depth, slope):
         """Return |v_y| / U at the depth fraction 1 - y/H, where the streamline has the slope dx/dy."""
         return depth**self.exponent / np.sqrt(1 + slope * slope)
-
-    def narrowest_gap(self, diameter: float, feed_solid_fraction: float) -> tuple[float, str]:
-        """Return the gap below which no gap is possible, m, and why; here there is none."""
-        return 0.0, ""
-
-    def widest_gap(self, diameter: float, entry_gap: float) -> float:
-        """Return the largest gap that leaves a bed, m."""
-        return entry_gap * (1 - 1e-9)
-
-    def held(self, gap: float, diameter: float, feed_solid_fraction: float) -> "PowerFlow":
-        """Return the profile with what is held while the gap floats: nothing here."""
-        return self
 
     def constants(self, gap: float, diameter: float, feed_solid_fraction: float) -> FlowConstants:
         """Return the profile as the kernels take it; it does not depend on the arguments."""
@@ -152,7 +152,7 @@ class NipFlow(_Profile):
         """Return the gap at which the nip angle given reaches the top of the bed, m."""
         return entry_gap - diameter * (1 - math.cos(self.nip_angle))
 
-    def held(self, gap: float, diameter: float, feed_solid_fraction: float) -> "NipFlow":
+    def held(self, gap: float, diameter: float, feed_solid_fraction: float) -> Self:
         """Return the profile with what is held while the gap floats: its nip angle at this gap."""
         angle = self.angle(gap, diameter, feed_solid_fraction)
         return self.model_copy(update={"nip_angle": angle, "cake_solid_fraction": None})
@@ -167,8 +167,8 @@ def cake_nip_angle(gap: float, diameter: float, ratio: float) -> float:
 
     From continuity between nip and gap, (s_b + D (1 - cos alpha)) cos alpha = ratio s_b (Torres & Casali 2009).
     """
-    room = math.sqrt((gap + diameter) ** 2 - 4 * gap * diameter * ratio)
-    return math.acos(min(((gap + diameter) + room) / (2 * diameter), 1.0))
+    room = max((gap + diameter) ** 2 - 4 * gap * diameter * ratio, 0.0)
+    return math.acos(min(((gap + diameter) + math.sqrt(room)) / (2 * diameter), 1.0))
 
 
 def densest_ratio(gap: float, diameter: float) -> float:
