@@ -63,8 +63,9 @@ def bounds(field: Any) -> str:
     """Return a field's bounds in its SI unit, or the words it takes."""
     kinds = (field.annotation, *get_args(field.annotation))
     words = dict.fromkeys(word for kind in kinds for word in get_args(kind) if isinstance(word, str))
-    limits = [f"{sign} {getattr(one, key):g}" for one in field.metadata for key, sign in SIGNS.items()
-              if hasattr(one, key)]
+    limits = [
+        f"{sign} {getattr(one, key):g}" for one in field.metadata for key, sign in SIGNS.items() if hasattr(one, key)
+    ]
     return ", ".join([*(f"`{word!r}`" for word in words), *limits])
 
 

@@ -1,6 +1,7 @@
-"""The documents: Python runs and prints what it says, command lines are taken, and the API page is up to date.
+"""The documents: Python runs and prints what it says, command lines are taken, and what is named exists.
 
-The README's own code, and the examples in docstrings, run in tests/test_ready.py and tests/test_pipeline.py.
+The README's own code, and the examples in docstrings, run in tests/test_ready.py and tests/test_run.py. The site is
+built strictly by .ci/run.
 """
 
 import dataclasses
@@ -20,8 +21,7 @@ from support import SCENE_TOML
 
 import hpgr
 import studies
-from hpgr import schema
-from hpgr.scene import Scene
+from hpgr.results import flags, schema
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -54,18 +54,6 @@ def assert_near(printed, told, where):
             assert float(found) == pytest.approx(float(said), rel=NEAR), (where, one, other)
 
 
-def run(page):
-    """Run the blocks of a page in one namespace."""
-    namespace = {"__name__": "page"}
-    for number, block in enumerate(blocks(page, "python"), start=1):
-        where = f"{page.name}, block {number}"
-        printed = io.StringIO()
-        with redirect_stdout(printed):
-            exec(compile(block, where, "exec"), namespace)
-        if expected(block):
-            assert_near(printed.getvalue().splitlines(), expected(block), where)
-
-
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """Run in an empty folder, drawing to files."""
@@ -79,9 +67,17 @@ def folder(tmp_path, monkeypatch):
     matplotlib.use(shown)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", RUN, ids=lambda page: page.name)
 def test_pages_run(page, folder, capfd):
-    run(page)
+    namespace = {"__name__": "page"}
+    for number, block in enumerate(blocks(page, "python"), start=1):
+        where = f"{page.name}, block {number}"
+        printed = io.StringIO()
+        with redirect_stdout(printed):
+            exec(compile(block, where, "exec"), namespace)
+        if expected(block):
+            assert_near(printed.getvalue().splitlines(), expected(block), where)
 
 
 def test_tutorial_says_what_it_prints():
@@ -116,8 +112,7 @@ class Parsed(BaseException):
     """Raised where a study has taken its arguments, so that it stops there."""
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_studies_take_the_commands(page, folder, monkeypatch, capsys):
+def test_studies_take_the_commands(folder, monkeypatch, capsys):
     taken = tyro.cli
 
     def stop(*arguments, **options):
@@ -126,20 +121,17 @@ def test_studies_take_the_commands(page, folder, monkeypatch, capsys):
 
     monkeypatch.setattr(tyro, "cli", stop)
     Path("mine.toml").write_text(SCENE_TOML)
-    for study, arguments in commands(page):
+    found = [(page.name, *command) for page in PAGES for command in commands(page)]
+    assert len(found) >= 20
+    for page, study, arguments in found:
         with pytest.raises((Parsed, SystemExit)) as ended:
             importlib.import_module(f"studies.{study}").main(arguments)
         helped = "--help" in arguments and getattr(ended.value, "code", 1) == 0
-        assert helped or ended.type is Parsed, (study, arguments, capsys.readouterr())
-
-
-def test_there_are_commands_to_take():
-    assert sum(len(commands(page)) for page in PAGES) >= 20
-    assert all(commands(page) for page in PAGES if page.name in ("README.md", "tutorial.md", "howto_calibrate.md"))
+        assert helped or ended.type is Parsed, (page, study, arguments, capsys.readouterr())
 
 
 def test_options_named_in_the_text_are_known():
-    known = {"--help", "--nthreads"}  # the latter of dask
+    known = {"--help", "--nthreads", "--strict"}  # the latter of dask and of mkdocs
     for path in (ROOT / "studies").glob("*.py"):
         options = getattr(importlib.import_module(f"studies.{path.stem}"), "Options", None)
         for field in dataclasses.fields(options) if options else ():
@@ -150,54 +142,42 @@ def test_options_named_in_the_text_are_known():
         assert named <= known, (page.name, named - known)
 
 
-def test_studies_named_are_there():
+def test_what_is_named_exists():
     for page in PAGES:
         for study in re.findall(r"studies\.([a-z]\w*)", text_of(page)):
             assert hasattr(studies, study) or importlib.util.find_spec(f"studies.{study}"), (page.name, study)
-
-
-def test_links_lead_somewhere():
-    for page in PAGES:
         for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text_of(page)):
-            if not target.startswith("http"):
-                assert (page.parent / target).exists(), (page.name, target)
+            assert target.startswith("http") or (page.parent / target).exists(), (page.name, target)
+        for folder, file in re.findall(r"`((?:hpgr|tests|studies|docs)/)?([\w/]+\.py)(?:::\w+)?`", text_of(page)):
+            homes = [folder] if folder else ["hpgr/", "tests/"]
+            assert any((ROOT / home / file).exists() for home in homes), (page.name, file)
 
 
-@pytest.fixture(scope="module")
-def api():
-    spec = importlib.util.spec_from_file_location("api", DOCS / "api.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_api_page_is_up_to_date(api):
-    assert text_of(api.PAGE) == api.page(), "run: python docs/api.py"
-
-
-def test_api_page_has_every_field_variable_and_flag(api):
-    page = text_of(api.PAGE)
-    for name, part in Scene.model_fields.items():
-        known = getattr(part.annotation, "model_fields", None) or {}
-        assert all(f"| `{name}.{key}` |" in page for key in known)
+def test_tables_of_the_site_have_every_field_variable_and_flag():
+    spec = importlib.util.spec_from_file_location("made_tables", DOCS / "tables.py")
+    tables = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tables)
+    page = tables.on_page_markdown(text_of(DOCS / "api.md"))
+    assert "<!--" not in page
     assert "| `rolls.gap` | `s_b` | m | required | ≥ 1e-06, ≤ 1000 | Gap where the rolls are closest |" in page
-    assert "| `material.strength` | `sigma_m` | Pa | 0.84 MPa | ≥ 1, ≤ 1e+15 |" in page
-    for name in (*schema.VARIABLES, *schema.COORDINATES, *schema.FLAGS):
-        assert f"| `{name}` |" in page
-    assert all(f"### `{name}" in page for name in hpgr.__all__)
+    assert "| `strength.reference_strength` | `sigma_m` | Pa | 0.84 MPa | ≥ 1, ≤ 1e+15 |" in page
+    assert "### `flow`, kind `nip`" in page
+    assert all(f"| `{name}` |" in page for name in (*schema.VARIABLES, *schema.COORDINATES, *flags.BITS))
 
 
-def needs_example(name, thing):
-    """Public functions need one, and the classes of the public face; what functions return does not."""
-    return inspect.isfunction(thing) or name.count(".") == 1
-
-
-def test_every_public_function_has_an_example(api):
-    public = dict(api.listed())
-    public |= {"hpgr.Scene.from_file": Scene.from_file, "hpgr.Scene.with_values": Scene.with_values}
-    wanted = {name: thing for name, thing in public.items() if needs_example(name, thing)}
-    assert len(wanted) > 50
-    missing = [name for name, thing in wanted.items() if ">>> " not in (inspect.getdoc(thing) or "")]
-    assert not missing, "give these an Examples section"
-    skipped = [name for name, thing in wanted.items() if "+SKIP" in inspect.getdoc(thing)]
-    assert not skipped, "these examples do not run"
+def test_every_public_function_has_an_example():
+    listed = re.findall(r"^::: ([\w.]+)$", text_of(DOCS / "api.md"), re.MULTILINE)
+    public = {f"hpgr.{name}": getattr(hpgr, name) for name in hpgr.__all__}
+    for name in listed:
+        home, _, last = name.rpartition(".")
+        thing = getattr(importlib.import_module(home), last)
+        members = vars(thing).items() if inspect.ismodule(thing) else [(last, thing)]
+        public |= {
+            f"{name}.{key}": one
+            for key, one in members
+            if inspect.isfunction(one) and not key.startswith("_") and (one.__module__ == name or one is thing)
+        }
+    assert len(public) > 50
+    given = {name: inspect.getdoc(one) or "" for name, one in public.items() if not inspect.ismodule(one)}
+    assert not [name for name, words in given.items() if ">>> " not in words], "give these an Examples section"
+    assert not [name for name, words in given.items() if "+SKIP" in words], "these examples do not run"
