@@ -1,0 +1,122 @@
+"""When a grain breaks: strength by size, cushioned by unlike neighbours (paper eqs. 1 and 2)."""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from hpgr.fields import Frozen, Metres, Number, Pascals, quantity
+
+SIZE_EFFECT = 0  # tag of the law in the kernels
+
+
+class StrengthConstants(NamedTuple):
+    """A law as the kernels take it."""
+
+    strength: int
+    slope: float  # 3 / w
+    cushion: float  # 1 / (2 n^2)
+    reference_size: float  # m
+
+
+class SizeEffectStrength(Frozen):
+    """ln sigma_s = ln sigma_m - (3/w) ln(s/s_m) + (ln(s/sbar)/n)^2 / 2, sbar the mean over a cell and its neighbours.
+
+    Bound: cushioning only strengthens, by a factor of at most exp((ln 3)^2 / (2 n^2)) for a grain among finer ones.
+    Closed limit: without cushioning (n = inf) a grain breaks until it is finer than the `critical_size`.
+
+    Examples
+    --------
+    >>> from hpgr.laws.strength import SizeEffectStrength
+    >>> SizeEffectStrength(reference_strength="2 MPa", cushioning=float("inf")).reference_strength
+    2000000.0
+    """
+
+    kind: Literal["size_effect"] = "size_effect"
+    reference_strength: Pascals = quantity(
+        0.84e6,
+        symbol="sigma_m",
+        unit="Pa",
+        text="Crushing strength of a grain of the reference size",
+        source="paper section 3 (quartz, 0.84 MPa)",
+        example="0.84 MPa",
+        ge=1,
+        le=1e15,
+    )
+    reference_size: Metres = quantity(
+        0.06,
+        symbol="s_m",
+        unit="m",
+        text="Grain size at which the reference strength holds",
+        source="paper section 3 (60 mm)",
+        example="60 mm",
+        ge=1e-6,
+        le=10,
+    )
+    weibull_modulus: Number = quantity(
+        3.04,
+        symbol="w",
+        text="Weibull modulus of grain strength; inf: strength without size effect",
+        source="paper section 3 (quartz, 3.04)",
+        example=3,
+        ge=1e-3,
+        allow_inf_nan=True,
+    )
+    cushioning: Number = quantity(
+        1.0,
+        symbol="n",
+        text="Cushioning constant: small n shields grains unlike their neighbours; inf: no cushioning",
+        source="paper eq. 2; value ours",
+        example=1,
+        ge=1e-6,
+        allow_inf_nan=True,
+    )
+    stress: Literal["mean", "major"] = Field(
+        "mean", description="Stress that crushes: 'mean' is p (the paper's figures), 'major' is p + 2 q / 3"
+    )
+
+    def crushing_stress(self, pressure, shear_stress):
+        """Return the stress that crushes, from mean stress p and triaxial shear stress q, all Pa."""
+        return pressure if self.stress == "mean" else pressure + 2 * shear_stress / 3
+
+    def log_stress(self, stress):
+        """Return ln(sigma_a / sigma_m) of a crushing stress in Pa; -inf, which breaks nothing, where there is none."""
+        with np.errstate(divide="ignore"):
+            return np.log(stress / self.reference_strength)
+
+    def log_strength(self, sizes):
+        """Return ln(sigma_s / sigma_m) of the cells of periodic lines (..., cell), m."""
+        sizes = np.asarray(sizes, float)
+        mean = (np.roll(sizes, 1, axis=-1) + np.roll(sizes, -1, axis=-1) + sizes) / 3
+        cushion = (np.log(sizes / mean) / self.cushioning) ** 2 / 2
+        return cushion - 3 / self.weibull_modulus * np.log(sizes / self.reference_size)
+
+    def critical_size(self, log_stress):
+        """Return the size in m above which grains break at ln(sigma_a / sigma_m) without cushioning; inf at -inf.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from hpgr.laws.strength import SizeEffectStrength
+        >>> SizeEffectStrength(weibull_modulus=3).critical_size(np.log([1.0, 2.0, 4.0]))
+        array([0.06 , 0.03 , 0.015])
+        """
+        with np.errstate(over="ignore"):  # a vanishing stress breaks no size: inf is the answer
+            return self.reference_size * np.exp(-np.asarray(log_stress) * (self.weibull_modulus / 3))
+
+    def critical_size_ratio(self, log_stress):
+        """Return the least effective size over s_m that breaks at ln(sigma_a / sigma_m); inf at -inf.
+
+        The effective size of a grain is the one that without cushioning would be as strong. Without size effect
+        (w = inf) its ratio is exp(-ln(sigma_s / sigma_m)) instead.
+        """
+        with np.errstate(over="ignore"):
+            return np.exp(-log_stress / (3 / self.weibull_modulus or 1.0))
+
+    def constants(self) -> StrengthConstants:
+        """Return the law as the kernels take it."""
+        cushion = 1 / (2 * self.cushioning * self.cushioning)  # a power would raise where the product is inf
+        return StrengthConstants(SIZE_EFFECT, 3 / self.weibull_modulus, cushion, self.reference_size)
+
+
+Strength = SizeEffectStrength
