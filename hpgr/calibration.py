@@ -327,7 +327,9 @@ def _at_test(scene: Scene, test: PilotTest, feed: Feed | None, floating: bool = 
         "feed": feed or TableFeed(table=[row for row, here in zip(table, known, strict=True) if here]),
         "resolution.sieves": tuple(test.sizes.tolist()),
     }
-    if getattr(scene.flow, "cake_solid_fraction", None) is not None:  # the angle is the ore's; it is held while the gap floats
+    if (
+        getattr(scene.flow, "cake_solid_fraction", None) is not None
+    ):  # the angle is the ore's; it is held while the gap floats
         values |= {"flow.nip_angle": _nip_angle(scene), "flow.cake_solid_fraction": None}
     if not floating:
         values["rolls.gap"] = test.gap if math.isnan(test.cake_thickness) else test.cake_thickness

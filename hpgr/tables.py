@@ -4,7 +4,9 @@ import csv
 import difflib
 import itertools
 import math
+import os
 import re
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -14,6 +16,8 @@ import numpy as np
 from hpgr.fields import parse
 
 _UNIT_IN_HEADER = re.compile(r"^\s*(?:size|sieve|aperture)\w*?[\s_]*[\[(]?\s*([a-zµμ]+)\s*[\])]?\s*$", re.IGNORECASE)
+_LARGEST, _MOST_LINES, _LONGEST_LINE = 10_000_000, 10_000, 10_000  # bytes, lines, characters of a table
+_MOST_FAULTS = 50  # that are told at once
 
 
 def read_sieve_table(path: str | Path) -> list[tuple[float, float]]:
@@ -25,8 +29,10 @@ def read_sieve_table(path: str | Path) -> list[tuple[float, float]]:
 
     Raises
     ------
+    OSError
+        If the file cannot be opened.
     ValueError
-        If the file cannot be read as such a table, naming the row. Whether the numbers make a
+        If the file cannot be read as such a table, naming the line. Whether the numbers make a
         distribution is the feed's own check.
 
     Examples
@@ -37,25 +43,51 @@ def read_sieve_table(path: str | Path) -> list[tuple[float, float]]:
     >>> rows[-1]
     (0.045, 100.0)
     """
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            lines = [line for line in file if line.strip() and not line.lstrip().startswith("#")]
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: byte {error.start} is not UTF-8; save the table as CSV in UTF-8") from None
-    if not lines:
-        raise ValueError(f"{path}: the table is empty; give a header and rows of size, percent passing")
-    header, *rows = csv.reader(lines)
+    (_, header), *rows = _lines(path)
     metres = _metres_per_unit(header, path)
-    table = [_numbers(row, number, path) for number, row in enumerate(rows, start=1)]
+    table = [_numbers(cells, number, path) for number, cells in rows]
     table = [(size * metres, percent) for size, percent in table]
     return table[::-1] if len(table) > 1 and table[0][0] > table[-1][0] else table
 
 
-def _metres_per_unit(header: list[str], path) -> float:
+def _lines(path: str | Path) -> list[tuple[int, list[str]]]:
+    """Return (line number, stripped cells) of every line that is neither blank nor a comment; at least one."""
+    text = _text_of(path)
+    kept = [(n, line) for n, line in enumerate(text.splitlines(), start=1) if not line.lstrip().startswith("#")]
+    if max((len(line) for _, line in kept), default=0) > _LONGEST_LINE or len(kept) > _MOST_LINES:
+        raise ValueError(
+            f"{path}: got {len(kept):,} lines; a table has at most {_MOST_LINES:,} lines of {_LONGEST_LINE:,} characters; "
+            "give the table alone"
+        )
+    lines = [(n, [cell.strip() for cell in next(csv.reader([line]), [])]) for n, line in kept]
+    lines = [(n, cells) for n, cells in lines if any(cells)]
+    if not lines:
+        raise ValueError(f"{path}: the table is empty; give a header and rows")
+    return lines
+
+
+def _text_of(path: str | Path) -> str:
+    status = os.stat(path)  # before it is opened: a pipe would make us wait, a device never end
+    if not stat.S_ISREG(status.st_mode):
+        raise ValueError(f"{path}: is no regular file; a table must be one; save it as CSV")
+    with open(path, "rb") as file:
+        data = file.read(_LARGEST + 1)
+    if len(data) > _LARGEST:
+        raise ValueError(f"{path}: got more than {_LARGEST:,} bytes; a table must be smaller; give the table alone")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: byte {error.start} is not UTF-8; save the table as CSV in UTF-8") from None
+    if "\0" in text:
+        raise ValueError(f"{path}: byte {data.index(0)} is 0, which no text has; save the table as CSV in UTF-8")
+    return text
+
+
+def _metres_per_unit(header: list[str], path: str | Path) -> float:
     found = _UNIT_IN_HEADER.match(header[0]) if len(header) == 2 else None
     if not found or "passing" not in header[1].lower():
         raise ValueError(
-            f"{path}: header {','.join(header)!r} is not 'size_<unit>,percent_passing'; "
+            f"{path}: header {_short(','.join(header))} is not 'size_<unit>,percent_passing'; "
             "name the unit of the sizes, for example 'size_mm,percent_passing'"
         )
     try:
@@ -64,14 +96,19 @@ def _metres_per_unit(header: list[str], path) -> float:
         raise ValueError(f"{path}: header {header[0]!r}: {error}; use a length such as mm") from None
 
 
-def _numbers(row: list[str], number: int, path) -> tuple[float, float]:
+def _numbers(cells: list[str], line: int, path: str | Path) -> tuple[float, float]:
     try:
-        size, percent = map(float, row)
+        size, percent = map(float, cells)
     except ValueError:
+        text = _short(",".join(cells))
         raise ValueError(
-            f"{path}: row {number} {','.join(row)!r} is not two numbers (size, percent passing); correct or remove it"
+            f"{path}: line {line} {text} is not two numbers (size, percent passing); correct or remove it"
         ) from None
     return size, percent
+
+
+def _short(text: str) -> str:
+    return repr(text if len(text) <= 60 else f"{text[:57]}...")
 
 
 class PilotTest(NamedTuple):
@@ -189,14 +226,17 @@ def read_pilot_tests(product: str | Path, operations: str | Path) -> tuple[Pilot
             for row in rows[1:]
         ]
     if faults:
-        raise ValueError(f"{len(faults)} fault(s) in the pilot tests:\n" + "\n".join(faults))
+        told = [*faults[:_MOST_FAULTS], *(["..."] if len(faults) > _MOST_FAULTS else [])]
+        raise ValueError(f"{len(faults)} fault(s) in the pilot tests:\n" + "\n".join(told))
     return tuple(_pilot_test(name, run, sieves[name]) for name, [run] in runs.items())
 
 
 def _rows(path: str | Path, columns: dict[str, _Column], faults: list[str]) -> list[_Row]:
     """Return the rows of a table that name a test; what is wrong in the table is appended to `faults`."""
-    lines = _numbered_lines(path, faults)
-    if not lines:
+    try:
+        lines = _lines(path)
+    except ValueError as error:
+        faults.append(str(error))
         return []
     (head, header), *body = lines
     unfit = list(_header_faults(header, columns))
@@ -207,21 +247,6 @@ def _rows(path: str | Path, columns: dict[str, _Column], faults: list[str]) -> l
         faults.append(f"{path}: no rows below the header; give one row per {'test' if 'U_m_s' in columns else 'sieve'}")
     found = (_row(line, header, cells, columns, path, faults) for line, cells in body)
     return [row for row in found if row is not None]
-
-
-def _numbered_lines(path: str | Path, faults: list[str]) -> list[tuple[int, list[str]]]:
-    """Return (line number, stripped cells) of every line that is neither blank nor a comment."""
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        faults.append(f"{path}: byte {error.start} is not UTF-8; save the table as CSV in UTF-8")
-        return []
-    kept = [(n, line) for n, line in enumerate(text.splitlines(), start=1) if not line.lstrip().startswith("#")]
-    lines = [(n, [cell.strip() for cell in next(csv.reader([line]), [])]) for n, line in kept]
-    lines = [(n, cells) for n, cells in lines if any(cells)]
-    if not lines:
-        faults.append(f"{path}: the table is empty; give a header and rows")
-    return lines
 
 
 def _header_faults(header: list[str], columns: dict[str, _Column]) -> Iterator[str]:
@@ -256,7 +281,7 @@ def _row(line, header, cells, columns, path, faults) -> _Row | None:
         try:
             values[name] = _value(text, columns[name])
         except ValueError as error:
-            faults.append(f"{path}: line {line}, {name}: got {repr(text) if text else 'an empty cell'}; {error}")
+            faults.append(f"{path}: line {line}, {name}: got {_short(text) if text else 'an empty cell'}; {error}")
     return _Row(line, test, values) if test else None
 
 

@@ -6,11 +6,12 @@ import pytest
 import hpgr
 from hpgr import calibration, presets
 from hpgr.calibration import PARAMETERS, fit_tests, predict
+from hpgr.laws.feed import SingleFeed
 from hpgr.tables import read_pilot_tests
 
 PSD, OPERATIONS = presets.DATA / "khd_porphyry_psd.csv", presets.DATA / "khd_porphyry_operations.csv"
 # n = inf is the closed form: quick, exact, and smooth in every parameter
-SMALL = {"resolution.points": 21, "resolution.streamlines": 1, "material.cushioning": math.inf,
+SMALL = {"resolution.points": 21, "resolution.streamlines": 1, "strength.cushioning": math.inf,
          "resolution.record": "product"}  # fmt: skip
 PLANTED = {"sigma_m": 3.1e6, "w": 2.4, "gamma": 0.45, "K": 1150e6, "alpha": math.radians(9.5), "kappa": 0.7, "T_0": 3e3}
 
@@ -29,8 +30,8 @@ def planted(names, roll_width=True, values=None):
     """The starting scene with planted values; G keeps its ratio to K."""
     fields = {PARAMETERS[name].field: PLANTED[name] for name in names}
     if "K" in names:
-        ore = presets.khd_pilot().material
-        fields["material.shear_modulus"] = PLANTED["K"] * ore.shear_modulus / ore.bulk_modulus
+        ore = presets.khd_pilot().elasticity
+        fields["elasticity.shear_modulus"] = PLANTED["K"] * ore.shear_modulus / ore.bulk_modulus
     return start(roll_width, fields | (values or {}))
 
 
@@ -111,11 +112,11 @@ def test_what_tests_do_not_tell_apart_is_named(pilot_tests):
 
 
 def test_same_input_gives_the_same_bits(pilot_tests):
-    scene = start(False, {"material.cushioning": 1.0, "resolution.cells": 60, "resolution.points": 21})
+    scene = start(False, {"strength.cushioning": 1.0, "resolution.cells": 60, "resolution.points": 21})
     first, again = (fit_tests(scene, [pilot_tests["K-P1"]], ["sigma_m", "gamma"]) for _ in range(2))
     assert first.estimates == again.estimates
     assert first.scene == again.scene
-    assert first.scene.material.strength == first.estimates["sigma_m"].value
+    assert first.scene.strength.reference_strength == first.estimates["sigma_m"].value
 
 
 def test_tables_without_what_was_not_measured_will_do(tmp_path):
@@ -129,7 +130,7 @@ def test_tables_without_what_was_not_measured_will_do(tmp_path):
     assert found.scene.rolls.specific_pressing_force == 2.5e6
     with pytest.raises(ValueError, match="fit: got K, fitted to throughput, power and cake thickness; must"):
         hpgr.calibrate(start(), None, product, operations, fit=["sigma_m", "K"])
-    other = hpgr.Feed(kind="single", size="30 mm")
+    other = SingleFeed(size="30 mm")
     assert hpgr.calibrate(start(), other, product, operations, fit=["sigma_m", "gamma"]).scene.feed == other
 
 
@@ -153,8 +154,12 @@ def test_report_is_short_and_has_units(pilot_tests):
         ),
         ([], {}, "fit: got nothing"),
         (["kappa"], {}, "fit: got kappa; must be fitted with a roll_width"),
-        (["alpha"], {"flow": {}}, "fit: got alpha; must be fitted with flow.profile = 'nip'"),
-        (["sigma_m"], {"material.bulk_modulus": 1e5, "material.shear_modulus": 5e4}, "scene: no gap carries the force"),
+        (["alpha"], {"flow": {}}, "fit: got alpha; must be fitted with flow.kind = 'nip'"),
+        (
+            ["sigma_m"],
+            {"elasticity.bulk_modulus": 1e5, "elasticity.shear_modulus": 5e4},
+            "scene: no gap carries the force",
+        ),
         (["K", "alpha", "T_0", "sigma_m"], {}, "fit: got K, alpha, T_0, fitted to"),
     ],
 )
@@ -185,7 +190,7 @@ def test_bounds_and_scales_go_there_and_back():
     for name, parameter in PARAMETERS.items():
         for value in (parameter.low, PLANTED.get(name, 1.0), parameter.high):
             assert parameter.value(parameter.scaled(value)) == pytest.approx(value, rel=1e-12, abs=1e-12)
-    assert calibration.PARAMETERS["K"].follower == "material.shear_modulus"
+    assert calibration.PARAMETERS["K"].follower == "elasticity.shear_modulus"
 
 
 def test_no_tests_and_no_product_to_fit_to_are_refused(pilot_tests):

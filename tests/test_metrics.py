@@ -2,11 +2,12 @@ import numpy as np
 import pytest
 from support import paper, sized
 
-from hpgr import feed, metrics, passing, peak_pressure, percentile_size, reduction_ratio, simulate, throughput
+from hpgr import passing, peak_pressure, percentile_size, reduction_ratio, simulate, throughput
+from hpgr.results import metrics
 
 
 def run(record, values=None):
-    cells = {"resolution.cells": sized(400, 64), "resolution.record": record, "resolution.photographs": 2}
+    cells = {"resolution.cells": sized(400, 64), "resolution.record": record, "resolution.snapshots": 2}
     return simulate(paper(cells | (values or {})), seed=81)
 
 
@@ -151,7 +152,7 @@ def test_throughput_is_that_of_the_formula(product):
     assert tubes.dims == ("streamline",)
     assert tubes.values == pytest.approx(by_hand / 3, rel=1e-6)
     assert tubes.attrs["units"] == "kg s-1"
-    scene = paper({"rolls.width": 0.5, "rolls.gap": 0.03, "material.solid_density": 1000})
+    scene = paper({"rolls.width": 0.5, "rolls.gap": 0.03, "bed.solid_density": 1000})
     assert metrics.gap_throughput(scene, 0.7) == pytest.approx(1000 * 0.7 * 0.03 * 0.5 * 5.96903, rel=1e-6)
 
 
@@ -170,7 +171,7 @@ def test_peak_pressure_is_the_largest_of_the_field(product):
 @pytest.mark.parametrize("percent", [50, 80])
 def test_reduction_ratio_is_feed_over_product(product, percent):
     scene = paper()
-    wanted = float(feed.quantile(scene.feed, percent / 100)) / product[f"p{percent}"].values
+    wanted = float(scene.feed.quantile(percent / 100)) / product[f"p{percent}"].values
     assert reduction_ratio(product, percent).values == pytest.approx(wanted, rel=1e-6)
     total = reduction_ratio(product, percent, total=True)
     assert float(total) == pytest.approx(wanted.mean(), rel=0.1)

@@ -1,89 +1,65 @@
 import re
 
 import numpy as np
+import pint
 import pytest
-import xarray as xr
-from support import feed_values, paper
+from support import paper
 
-from hpgr import Scene, presets, schema, simulate
+from hpgr import Scene, presets, simulate
+from hpgr.results import flags, schema
 
-RECORDS = ("cells", "distributions", "product", "stress only")
-WITH_EXCHANGE = ("exchange",) if "exchange" in Scene.model_fields else ()
-
-
-def dataset(record):
-    if record == "stress only":
-        return simulate(paper({"resolution.cells": 0}))
-    if record == "exchange":
-        return simulate(paper({"exchange.mixing": 0.1, "resolution.points": 11}))
-    return simulate(paper({"resolution.record": record, "resolution.photographs": 2}))
+TABLE = schema.COORDINATES | schema.VARIABLES
+SCENES = {
+    "stress only": {"resolution.cells": 0},
+    "exchange": {"exchange.mixing": 0.1, "resolution.points": 11},
+    "roll width": {"resolution.record": "product", "roll_width": {}},
+    **{name: {"resolution.record": name, "resolution.snapshots": 2} for name in ("cells", "distributions", "product")},
+}
 
 
-@pytest.fixture(scope="module", params=RECORDS + WITH_EXCHANGE)
-def ds(request):
-    return dataset(request.param)
-
-
-def test_every_variable_has_units_and_a_long_name(ds):
-    for name in ds.variables:
-        assert ds[name].attrs["units"], name
-        assert len(ds[name].attrs["long_name"]) > 5, name
-
-
-def test_every_variable_is_as_the_table_says(ds):
-    for name, variable in ds.variables.items():
-        entry = (schema.VARIABLES | schema.COORDINATES)[name]
-        assert variable.dims == entry.dims
-        assert variable.dtype == entry.dtype
-        assert variable.attrs["units"] == entry.units
-    assert set(ds.coords) <= set(schema.COORDINATES)
-
-
-def test_table_holds_nothing_that_no_simulation_produces():
-    produced = set().union(*(set(dataset(record).variables) for record in RECORDS + WITH_EXCHANGE))
-    scene = paper({"resolution.record": "product", "material.cushioning": np.inf})
-    produced |= set(simulate(scene, tolerance=0.1).variables)
-    produced |= set(simulate(paper({"resolution.record": "product", "roll_width": {}})).variables)
+@pytest.fixture(scope="module")
+def datasets():
+    found = {name: simulate(paper(values)) for name, values in SCENES.items()}
+    smooth = paper({"resolution.record": "product", "strength.cushioning": np.inf})
     held = {"rolls.specific_pressing_force": 2.5e6, "resolution.cells": 0}
-    produced |= set(simulate(presets.khd_pilot().with_values(held)).variables)
-    assert produced == set(schema.VARIABLES) | set(schema.COORDINATES)
+    found["tolerance"] = simulate(smooth, tolerance=0.1)
+    found["floating gap"] = simulate(presets.khd_pilot().with_values(held))
+    return found
 
 
-def test_units_are_read_by_pint():
-    import pint
+def test_every_variable_is_as_the_table_says(datasets):
+    for dataset in datasets.values():
+        for name, variable in dataset.variables.items():
+            entry = TABLE[name]
+            assert (variable.dims, variable.dtype, variable.attrs["units"]) == (entry.dims, entry.dtype, entry.units)
+        assert set(dataset.coords) <= set(schema.COORDINATES)
+        for value in dataset.attrs.values():  # as NetCDF can hold them
+            assert isinstance(value, str | int | float | np.number)
+            assert not isinstance(value, bool)
+    assert datasets["cells"]["size"].dims == ("time", "streamline", "point", "cell")
+    assert datasets["distributions"]["mass_fraction"].dims == ("time", "streamline", "point", "sieve")
 
+
+def test_table_holds_nothing_that_no_simulation_produces(datasets):
+    assert set().union(*(dataset.variables for dataset in datasets.values())) == set(TABLE)
+
+
+def test_names_are_short_enough_for_an_axis_and_units_are_read_by_pint():
     registry = pint.UnitRegistry()
-    for entry in (schema.VARIABLES | schema.COORDINATES).values():
+    for name, entry in (TABLE | schema.SWEEP).items():
+        assert 4 < len(entry.long_name) <= 40, name
+        assert entry.attributes().keys() >= ({"long_name", "units"} if entry.dtype is not object else {"long_name"})
         spelled = re.sub(r"([a-z])(-?\d)", r"\1^\2", entry.units).replace(" ", "*")
         registry.parse_units("" if spelled == "1" else spelled)
-
-
-def test_dims_run_time_streamline_point_cell():
-    assert dataset("cells")["size"].dims == ("time", "streamline", "point", "cell")
-    assert dataset("distributions")["mass_fraction"].dims == ("time", "streamline", "point", "sieve")
-
-
-def test_attributes_survive_netcdf(ds, tmp_path):
-    for value in ds.attrs.values():
-        assert isinstance(value, str | int | float | np.number)
-        assert not isinstance(value, bool)
-    path = tmp_path / "scene.nc"
-    ds.to_netcdf(path, engine="netcdf4")
-    with xr.open_dataset(path, engine="netcdf4", decode_times=False) as back:
-        assert back.attrs == ds.attrs
-        assert Scene.model_validate_json(back.attrs["scene"]) == Scene.model_validate_json(ds.attrs["scene"])
-        assert set(back.variables) == set(ds.variables)
-        assert np.array_equal(back["pressure"], ds["pressure"])
 
 
 @pytest.mark.parametrize(
     "values",
     [
-        {},
-        {"material.cushioning": float("inf"), "material.weibull_modulus": float("inf")},
-        feed_values(kind="table", table=((0.001, 0.0), (0.05, 100.0))),
+        {"strength.cushioning": float("inf"), "strength.weibull_modulus": float("inf")},
+        {"feed": {"kind": "table", "table": ((0.001, 0.0), (0.05, 100.0))}},
     ],
-    ids=["paper", "with inf", "with a table"],
+    ids=["with inf", "with a table"],
 )
 def test_scene_attribute_rebuilds_the_scene(values):
     scene = paper(values | {"resolution.cells": 0})
@@ -91,22 +67,31 @@ def test_scene_attribute_rebuilds_the_scene(values):
 
 
 def test_flags_are_masks_with_meanings():
-    flags = schema.attributes("flags")
-    masks = flags["flag_masks"].tolist()
+    found = schema.attributes("flags")
+    masks, meanings = found["flag_masks"].tolist(), found["flag_meanings"].split()
     assert masks == [2**k for k in range(len(masks))]
-    assert len(flags["flag_meanings"].split()) == len(masks)
-    assert dict(zip(flags["flag_meanings"].split(), masks, strict=True)) == schema.FLAGS
+    assert dict(zip(meanings, masks, strict=True)) == flags.BITS
+    assert flags.names(sum(masks)) == meanings
+    assert all(flag.meaning for flag in flags.FLAGS)
 
 
-def test_unknown_names_are_refused_and_none_is_left_out():
+def test_unknown_names_are_refused_none_is_left_out_and_values_are_cast_to_their_storage_type():
     with pytest.raises(KeyError, match="pressure_drop"):
         schema.to_dataset({"pressure_drop": 1.0}, {})
-    assert "p50" not in schema.to_dataset({"throughput": 1.0, "p50": None}, {})
-
-
-def test_values_are_cast_once_to_their_storage_type():
-    made = schema.to_dataset({"throughput": 1.0, "flags": 3, "xi": np.array([0.1, 0.2])}, {"a": 1})
-    assert made["throughput"].dtype == np.float32
-    assert made["flags"].dtype == np.int32
-    assert made["xi"].dtype == np.float64
+    own = {"steps": schema.Variable(("steps",), "1", "time steps", dtype=np.int32)}
+    values = {"throughput": 1.0, "flags": 3, "p50": None, "steps": [1, 2]}
+    made = schema.to_dataset(values, {"a": 1}, own)
+    assert {name: variable.dtype for name, variable in made.variables.items()} == {
+        "throughput": np.float32, "flags": np.int32, "steps": np.int32,
+    }  # fmt: skip
+    assert list(made.coords) == ["steps"]
     assert made.attrs == {"a": 1}
+
+
+def test_axes_and_datasets_have_their_attributes_from_here():
+    axis = schema.field_axis("rolls.gap", "gap")
+    assert axis.dims == ("gap",)
+    assert axis.attributes().items() >= {"units": "m", "scene_field": "rolls.gap"}.items()
+    found = schema.dataset_attributes("A study", seed=3)
+    assert (found["Conventions"], found["seed"]) == ("CF-1.11", 3)
+    assert "numba " in found["versions"]

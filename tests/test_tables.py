@@ -1,9 +1,11 @@
 import math
+import os
 from importlib.resources import files
 
 import pytest
 
-from hpgr import Feed, presets, tables
+from hpgr import presets, tables
+from hpgr.laws.feed import TableFeed
 
 
 def write(path, text):
@@ -17,10 +19,8 @@ def write(path, text):
         ("size_mm", 1e-3),
         ("size [mm]", 1e-3),
         ("Size (mm)", 1e-3),
-        ("sieve_um", 1e-6),
         ("aperture [µm]", 1e-6),
-        ("sieve_size_mm", 1e-3),
-        ("size_m", 1.0),
+        ("sieve_size_m", 1.0),
         ("size_inch", 0.0254),
     ],
 )
@@ -45,7 +45,7 @@ def test_shuffled_rows_are_left_for_the_feed_to_refuse(tmp_path):
     path = write(tmp_path / "t.csv", "size_mm,percent_passing\n1,10\n4,100\n2,50\n")
     assert [percent for _, percent in tables.read_sieve_table(path)] == [10, 100, 50]
     with pytest.raises(ValueError, match=r"row 3 \(2 mm, 50 %\)"):
-        Feed(kind="table", table=path)
+        TableFeed(table=path)
 
 
 @pytest.mark.parametrize(
@@ -59,9 +59,9 @@ def test_shuffled_rows_are_left_for_the_feed_to_refuse(tmp_path):
         ("size_mm,percent_passing,n\n1,2,3\n", "name the unit"),
         ("size_kg,percent_passing\n1,2\n", "use a length"),
         ("size_foo,percent_passing\n1,2\n", "use a length"),
-        ("size_mm,percent_passing\n1,10\nx,100\n", r"row 2 'x,100' is not two numbers"),
-        ("size_mm,percent_passing\n1,10\n2\n", r"row 2 '2' is not two numbers"),
-        ("size_mm,percent_passing\n1,10,3\n", r"row 1 '1,10,3' is not two numbers"),
+        ("size_mm,percent_passing\n1,10\nx,100\n", r"line 3 'x,100' is not two numbers"),
+        ("size_mm,percent_passing\n1,10\n2\n", r"line 3 '2' is not two numbers"),
+        ("size_mm,percent_passing\n1,10,3\n", r"line 2 '1,10,3' is not two numbers"),
     ],
 )
 def test_unreadable_tables_are_refused_naming_file_and_row(tmp_path, text, words):
@@ -75,8 +75,8 @@ def test_missing_file_is_an_os_error_and_the_feeds_fault(tmp_path):
     path = tmp_path / "none.csv"
     with pytest.raises(OSError, match=r"none\.csv"):
         tables.read_sieve_table(path)
-    with pytest.raises(ValueError, match=r"none\.csv"):
-        Feed(kind="table", table=path)
+    with pytest.raises(ValueError, match=r"the file cannot be read \(No such file"):
+        TableFeed(table=path)
 
 
 def test_shipped_table_is_the_published_one():
@@ -224,19 +224,39 @@ def test_a_single_sieve_is_no_distribution(tmp_path):
     assert "line 2, test: got one sieve for A; must be at least two" in fault
 
 
-def test_a_table_in_another_encoding_is_refused(tmp_path):
-    path = tmp_path / "p.csv"
-    path.write_bytes(PRODUCT.encode("utf-16"))
-    with pytest.raises(ValueError, match="is not UTF-8; save the table as CSV in UTF-8"):
-        tables.read_pilot_tests(path, write(tmp_path / "o.csv", OPERATIONS))
-
-
 def test_missing_pilot_table_is_an_os_error(tmp_path):
     with pytest.raises(OSError, match=r"none\.csv"):
         tables.read_pilot_tests(tmp_path / "none.csv", write(tmp_path / "o.csv", OPERATIONS))
 
 
-def test_a_sieve_table_that_is_no_utf8_is_refused(tmp_path):
-    (tmp_path / "a.csv").write_bytes(b"size_\xe9,percent_passing\n1,2\n")
-    with pytest.raises(ValueError, match=r"a\.csv: byte 5 is not UTF-8; save the table"):
-        tables.read_sieve_table(tmp_path / "a.csv")
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"size_\xe9,percent_passing\n1,2\n", "byte 5 is not UTF-8; save the table as CSV in UTF-8"),
+        (b"\x7fELF\0\0", "byte 4 is 0, which no text has"),
+        (b"1" * 11_000_000, "got more than 10,000,000 bytes; a table must be smaller"),
+        (b"1" * 200_000, "got 1 lines; a table has at most 10,000 lines of 10,000 characters"),
+        (b"1,2\n" * 10_001, "got 10,001 lines; a table has"),
+        (b"size_mm,percent_passing\n1,2\n" + b"x" * 9000, r"line 3 'x{57}\.\.\.' is not two numbers"),
+        (b"test,feed" + b",q" * 1000 + b"\n", "."),
+    ],
+    ids=["latin", "binary", "huge", "one line", "many lines", "long cell", "many columns"],
+)
+def test_what_is_no_table_gets_one_short_refusal(tmp_path, data, words):
+    path = tmp_path / "a.csv"
+    path.write_bytes(data)
+    for read in (tables.read_sieve_table, lambda path: tables.read_pilot_tests(path, path)):
+        with pytest.raises(ValueError, match=r"a\.csv: ") as error:
+            read(path)
+        assert len(str(error.value)) < 12_000
+    with pytest.raises(ValueError, match=words):
+        tables.read_sieve_table(path)
+
+
+def test_pipes_and_devices_are_refused_unread(tmp_path):
+    os.mkfifo(tmp_path / "pipe.csv")
+    for path in (tmp_path / "pipe.csv", "/dev/zero", tmp_path):
+        with pytest.raises(ValueError, match="is no regular file; a table must be one"):
+            tables.read_sieve_table(path)
+        with pytest.raises(ValueError, match="is no regular file"):
+            TableFeed(table=path)

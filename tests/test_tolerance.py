@@ -5,9 +5,11 @@ import math
 import numpy as np
 import pytest
 
+from support import COMPILED
+
 import hpgr
-from hpgr import pipeline, tolerance
-from tests.support import COMPILED
+from hpgr import tolerance
+from hpgr.run import run_scene
 
 WANTED = 0.03
 
@@ -22,9 +24,9 @@ def random_scenes(count):
                 "rolls.gap": gap,
                 "rolls.entry_gap": gap * source.uniform(14, 22),
                 "feed.top_size": source.uniform(0.03, 0.07),
-                "material.cushioning": source.choice([0.5, 0.7, 1.0, 2.0, math.inf]) if COMPILED else math.inf,
-                "material.weibull_modulus": source.uniform(2.5, 5),
-                "material.fragment_exponent": source.uniform(0.4, 1.5),
+                "strength.cushioning": source.choice([0.5, 0.7, 1.0, 2.0, math.inf]) if COMPILED else math.inf,
+                "strength.weibull_modulus": source.uniform(2.5, 5),
+                "fragments.exponent": source.uniform(0.4, 1.5),
                 "flow.exponent": source.uniform(0.9, 1.1),
                 "resolution.record": "product",
             }
@@ -40,9 +42,10 @@ def reference(scene):
             "resolution.cells": 5000,
         }
     )
-    return tolerance.figures_of(pipeline.crush(fine, pipeline.prepare(fine), 99, 0))
+    return tolerance.figures_of(run_scene(fine, 99).values)
 
 
+@pytest.mark.slow
 def test_true_error_is_within_the_stated_one_on_random_scenes():
     # 40 scenes x 3 figures. The estimate is bias + 2 standard errors: 5 % may miss by design. The seeds are fixed,
     # so the outcome is too; over 100 other scenes 2 of 300 figures missed, and with 120 figures that miss with
@@ -51,8 +54,7 @@ def test_true_error_is_within_the_stated_one_on_random_scenes():
     hits, figures = 0, 0
     for scene in scenes:
         estimate = tolerance.refine(scene, WANTED)
-        values = pipeline.crush(estimate.scene, pipeline.prepare(estimate.scene), 0, 0)
-        found, true = tolerance.figures_of(values), reference(scene)
+        found, true = tolerance.figures_of(run_scene(estimate.scene).values), reference(scene)
         for name, stated in estimate.errors().items():
             assert stated <= WANTED
             hits += abs(tolerance.relative(found, true, name)) <= stated
@@ -71,12 +73,12 @@ def test_strong_cushioning_takes_more_steps():
     # model page, section 11: at n = 0.5 P80 still moves by 2 % between 800 and 1,600 points
     scene = hpgr.presets.paper().with_values({"resolution.record": "product"})
     mild = tolerance.refine(scene, 0.02).scene.resolution.points
-    strong = tolerance.refine(scene.with_values({"material.cushioning": 0.5}), 0.02).scene.resolution.points
+    strong = tolerance.refine(scene.with_values({"strength.cushioning": 0.5}), 0.02).scene.resolution.points
     assert strong > 1601 > mild
 
 
 def test_result_carries_its_errors_and_resolution():
-    scene = hpgr.presets.paper().with_values({"material.cushioning": math.inf, "resolution.record": "product"})
+    scene = hpgr.presets.paper().with_values({"strength.cushioning": math.inf, "resolution.record": "product"})
     dataset = hpgr.simulate(scene, tolerance=0.02)
     for name in ("p80_total_error", "fineness_error", "peak_pressure_error"):
         assert 0 < dataset[name] <= 0.02
@@ -96,7 +98,7 @@ def test_stress_alone_has_the_error_of_its_pressure_only():
 
 def test_wanted_cells_of_a_scene_without_cushioning_are_judged_as_cells():
     # its product alone would have the closed form, without noise
-    scene = hpgr.presets.paper().with_values({"material.cushioning": math.inf})
+    scene = hpgr.presets.paper().with_values({"strength.cushioning": math.inf})
     if not COMPILED:
         scene = scene.with_values({"resolution.streamlines": 1})
     estimate = tolerance.refine(scene, 0.2 if not COMPILED else 0.05)

@@ -82,7 +82,9 @@ def _unusual_machine(run: Run) -> str:
 def _no_compaction(run: Run) -> str:
     if run.bed.stress.pressure.astype(np.float32).any():  # as it is stored: of less nothing would be seen
         return ""
-    why = "the gap equals the entry gap" if run.bed.geometry.height == 0 else "the bed only dilates on its way to the gap"
+    why = (
+        "the gap equals the entry gap" if run.bed.geometry.height == 0 else "the bed only dilates on its way to the gap"
+    )
     return f"{why}: nothing is compacted nor pressed, the product is the feed"
 
 
@@ -90,14 +92,18 @@ def _solid_fraction_capped(run: Run) -> str:
     needed, most = float(run.bed.stress.continuity_solid_fraction.max()), run.scene.bed.max_solid_fraction
     if needed <= most:
         return ""
-    return f"mass continuity would need a solid fraction of {needed:.3g} at the exit; held at max_solid_fraction {most:g}"
+    return (
+        f"mass continuity would need a solid fraction of {needed:.3g} at the exit; held at max_solid_fraction {most:g}"
+    )
 
 
 def _single_particle_nipping(run: Run) -> str:
     gaps = run.scene.feed.largest_grain / run.scene.rolls.gap
     if gaps <= _NIPPING:
         return ""
-    return f"the feed's top size is {gaps:.3g} gaps; above {_NIPPING:g} the rolls nip single grains, which is not modelled"
+    return (
+        f"the feed's top size is {gaps:.3g} gaps; above {_NIPPING:g} the rolls nip single grains, which is not modelled"
+    )
 
 
 def _tension_clamped(run: Run) -> str:

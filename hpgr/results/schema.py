@@ -52,7 +52,8 @@ class Variable(NamedTuple):
 STATUS = {"ok": 0, "refused": 1, "failed": 2, "timeout": 3, "worker_lost": 4}
 
 _POINT = ("streamline", "point")
-_WHOLE = "whole gap"
+_WHOLE, _ESTIMATE = "whole gap", "estimated: bias + 2 standard errors"
+_STATUS_ATTRIBUTES = {"flag_values": np.array(list(STATUS.values()), np.int8), "flag_meanings": " ".join(STATUS)}
 
 COORDINATES = {
     "time": Variable(("time",), "1", "snapshot number", "snapshots of the steady machine", np.int32),
@@ -60,18 +61,12 @@ COORDINATES = {
     "steady": Variable(
         ("time",), "1", "whether the snapshot is steady", "taken after one residence time or later", np.int8
     ),
-    "xi": Variable(
-        ("streamline",), "1", "position of the streamline",
-        "distance from the mid-plane over that of the outermost streamline", np.float64,
-    ),
+    "xi": Variable(("streamline",), "1", "position of the streamline", "0 mid-plane, 1 roll", np.float64),
     "x": Variable(_POINT, "m", "distance from the mid-plane", "across the gap", np.float64),
     "height": Variable(_POINT, "m", "height above the minimum gap", dtype=np.float64),
     "residence_time": Variable(_POINT, "s", "residence time", "since the first material point", np.float64),
     "sieve": Variable(("sieve",), "m", "sieve size", dtype=np.float64),
-    "width_position": Variable(
-        ("slice",), "1", "position along the roll width",
-        "distance from the middle of the roll width over half of it", np.float64,
-    ),
+    "width_position": Variable(("slice",), "1", "position along the roll width", "0 middle, 1 end", np.float64),
 }
 
 VARIABLES = {
@@ -120,9 +115,9 @@ VARIABLES = {
     "p80": Variable(("streamline",), "m", "product P80", "size that 80 % of the stream tube's product passes"),
     "p50_total": Variable((), "m", f"product P50, {_WHOLE}", "size that 50 % of the mass passes"),
     "p80_total": Variable((), "m", f"product P80, {_WHOLE}", "size that 80 % of the mass passes"),
-    "passing_slice": Variable(("slice", "sieve"), "1", "mass fraction passing", "product of the slice of the roll width"),
-    "passing_width_centre": Variable(("sieve",), "1", "mass fraction passing", "product of the centre of the roll width"),
-    "passing_width_edge": Variable(("sieve",), "1", "mass fraction passing", "product of the edge of the roll width"),
+    "passing_slice": Variable(("slice", "sieve"), "1", "mass fraction passing", "product of the slice"),
+    "passing_width_centre": Variable(("sieve",), "1", "mass fraction passing", "centre of the roll width"),
+    "passing_width_edge": Variable(("sieve",), "1", "mass fraction passing", "edge of the roll width"),
     "p50_width_centre": Variable((), "m", "centre product P50", "of the centre of the roll width"),
     "p80_width_centre": Variable((), "m", "centre product P80", "of the centre of the roll width"),
     "p50_width_edge": Variable((), "m", "edge product P50", "of the edge of the roll width"),
@@ -139,9 +134,9 @@ VARIABLES = {
     "streamlines_used": Variable((), "1", "streamlines used", "chosen for the wanted tolerance", np.int32),
     "points_used": Variable((), "1", "points used", "per streamline, chosen for the wanted tolerance", np.int32),
     "cells_used": Variable((), "1", "cells used", "per material point, chosen for the wanted tolerance", np.int32),
-    "p80_total_error": Variable((), "1", "relative error of P80", "estimated: bias + 2 standard errors"),
-    "fineness_error": Variable((), "1", "relative error of the fineness", "of the mass fraction below 1 mm, estimated: bias + 2 standard errors"),
-    "peak_pressure_error": Variable((), "1", "relative error of the peak pressure", "estimated: bias + 2 standard errors"),
+    "p80_total_error": Variable((), "1", "relative error of P80", _ESTIMATE),
+    "fineness_error": Variable((), "1", "relative error of the fineness", f"below 1 mm; {_ESTIMATE}"),
+    "peak_pressure_error": Variable((), "1", "relative error of the peak pressure", _ESTIMATE),
     "flags": Variable((), "1", "limits that were hit", "in words: diagnostics", np.int32, flags.ATTRIBUTES),
 }
 
@@ -150,10 +145,7 @@ SWEEP = {
     "replicate": Variable(
         ("replicate",), "1", "independent repetition", dtype=np.int32, extra={"standard_name": "realization"}
     ),
-    "status": Variable(
-        (), "1", "what became of the case", dtype=np.int8,
-        extra={"flag_values": np.array(list(STATUS.values()), np.int8), "flag_meanings": " ".join(STATUS)},
-    ),
+    "status": Variable((), "1", "what became of the case", dtype=np.int8, extra=_STATUS_ATTRIBUTES),
     "message": Variable((), "", "why the case holds no result", dtype=object),
     "diagnostics": Variable((), "", "limits that the case hit, in words", dtype=object),
 }
@@ -197,7 +189,7 @@ def _version(library: str) -> str:
         return "unknown"
 
 
-def to_dataset(values: Mapping[str, Any], attrs: Mapping[str, Any], own: Mapping[str, Variable] | None = None) -> xr.Dataset:
+def to_dataset(values: Mapping[str, Any], attrs: Mapping[str, Any], own: Mapping[str, Variable] = {}) -> xr.Dataset:
     """Return arrays by name as a labelled Dataset; None is left out.
 
     Parameters
@@ -214,7 +206,7 @@ def to_dataset(values: Mapping[str, Any], attrs: Mapping[str, Any], own: Mapping
     KeyError
         If a name is in no table.
     """
-    table = {**COORDINATES, **VARIABLES, **SWEEP, **(own or {})}
+    table = {**COORDINATES, **VARIABLES, **SWEEP, **own}
     made = {
         name: xr.Variable(table[name].dims, np.asarray(value, table[name].dtype), table[name].attributes())
         for name, value in values.items()

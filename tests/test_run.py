@@ -6,10 +6,16 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from support import KS, feed_values, first_cells, ks_distance, paper, sized
+from support import KS, first_cells, ks_distance, paper, sized
 
 import hpgr
-from hpgr import Scene, budget, feed, flow, geometry, kernels, limits, presets, schema, simulate, solve
+from hpgr import Scene, cost, presets, simulate
+from hpgr.bed import loaded
+from hpgr.fields import values_of
+from hpgr.grains import closed_form, kernels, solve
+from hpgr.results import flags as limits
+from hpgr.results import schema
+from hpgr.run import load, run_scene
 
 INF = math.inf
 EQUAL_GAPS = {"rolls.gap": 0.06, "rolls.entry_gap": 0.06}
@@ -17,7 +23,7 @@ EQUAL_GAPS = {"rolls.gap": 0.06, "rolls.entry_gap": 0.06}
 
 def flags(ds):
     """Names of the flags that are set."""
-    return {name for name, mask in schema.FLAGS.items() if int(ds["flags"]) & mask}
+    return set(limits.names(int(ds["flags"])))
 
 
 def same_bits(first, second, names=None):
@@ -29,8 +35,8 @@ def product_sizes(ds):
 
 
 def feed_sizes(scene, seed=0, replicate=0):
-    lines, photographs = range(scene.resolution.streamlines), range(scene.resolution.photographs)
-    return np.array([[first_cells(scene, seed, (replicate, i, t))[0] for i in lines] for t in photographs])
+    lines, snapshots = range(scene.resolution.streamlines), range(scene.resolution.snapshots)
+    return np.array([[first_cells(scene, seed, (replicate, i, t))[0] for i in lines] for t in snapshots])
 
 
 # --- determinism -------------------------------------------------------------------------------------------
@@ -54,14 +60,14 @@ def test_threads_give_the_bits_of_a_serial_run():
     assert all(one.identical(other) for one, other in zip(serial, threaded, strict=True))
 
 
-def test_photographs_are_independent():
-    """Correlation of two photographs' cells: |r| sqrt(M) beyond 5 once in 1.7 million, 3 streamlines."""
+def test_snapshots_are_independent():
+    """Correlation of two snapshots' cells: |r| sqrt(M) beyond 5 once in 1.7 million, 3 streamlines."""
     cells = sized(2000, 300)
-    scene = paper({"resolution.photographs": 2, "resolution.cells": cells, "resolution.points": 31})
+    scene = paper({"resolution.snapshots": 2, "resolution.cells": cells, "resolution.points": 31})
     first, second = product_sizes(simulate(scene))
     for line in range(3):
         assert abs(np.corrcoef(first[line], second[line])[0, 1]) * math.sqrt(cells) < 5
-    assert np.array_equal(first, product_sizes(simulate(scene.with_values({"resolution.photographs": 1})))[0])
+    assert np.array_equal(first, product_sizes(simulate(scene.with_values({"resolution.snapshots": 1})))[0])
 
 
 @pytest.mark.parametrize("name", ["seed", "replicate"])
@@ -87,31 +93,31 @@ def test_seeds_that_netcdf_cannot_hold_are_refused_or_written_as_text():
     "values",
     [
         {},
-        {"material.fragment_exponent": 1e-3},
-        {"material.fragment_exponent": 1e6},
-        {"material.cushioning": INF, "material.weibull_modulus": INF},
-        {"material.cushioning": 1e-6},
-        {"material.strength": 1.0},
+        {"fragments.exponent": 1e-3},
+        {"fragments.exponent": 1e6},
+        {"strength.cushioning": INF, "strength.weibull_modulus": INF},
+        {"strength.cushioning": 1e-6},
+        {"strength.reference_strength": 1.0},
         {"flow.entry_fraction": 0.9},
         {"resolution.points": 2},
         {"resolution.cells": 1},
-        {"material.size_floor": 0.02},
-        {"stress.crushing": "major", "stress.integrator": "euler"},
-        {"material.elastic_exponent": -0.5},
-        {"material.weibull_modulus": 1e-3},
-        feed_values(kind="power_law", top_size=0.06, exponent=0.1),
+        {"fragments.size_floor": 0.02},
+        {"strength.stress": "major", "elasticity.integrator": "euler"},
+        {"elasticity.exponent": -0.5},
+        {"strength.weibull_modulus": 1e-3},
+        {"feed": {"kind": "power_law", "top_size": 0.06, "exponent": 0.1}},
     ],
     ids=str,
 )
 def test_sizes_are_positive_never_grow_and_stay_below_the_feeds_top(values):
-    scene = paper(values | {"resolution.photographs": 2})
+    scene = paper(values | {"resolution.snapshots": 2})
     ds = simulate(scene)
     size = ds["size"].values
     start = feed_sizes(scene)
     along = np.concatenate([start[:, :, None], size], axis=2)
     assert np.all(np.diff(along, axis=2) <= 0)
     assert size.min() >= np.float32(kernels.SMALLEST)
-    assert size.max() <= np.float32(scene.feed.coarsest)
+    assert size.max() <= np.float32(scene.feed.largest_grain)
     for name in ("passing", "passing_total"):
         found = ds[name].values
         assert np.all((found >= 0) & (found <= 1))
@@ -122,7 +128,7 @@ def test_sizes_are_positive_never_grow_and_stay_below_the_feeds_top(values):
 
 
 def test_distributions_hold_all_mass_at_every_point():
-    ds = simulate(paper({"resolution.record": "distributions", "resolution.photographs": 2}))
+    ds = simulate(paper({"resolution.record": "distributions", "resolution.snapshots": 2}))
     assert np.all(ds["mass_fraction"] >= 0)
     assert ds["mass_fraction"].sum("sieve").values == pytest.approx(1.0, abs=1e-6)
     finer = ds["mass_fraction"].cumsum("sieve").diff("point")
@@ -150,7 +156,7 @@ def test_product_is_finer_at_mid_gap_than_at_the_roll():
                 "resolution.points": 201,
                 "resolution.cells": sized(20_000, 500),
                 "resolution.record": "product",
-                "resolution.photographs": sized(1, 10),
+                "resolution.snapshots": sized(1, 10),
             }
         )
     )
@@ -189,15 +195,10 @@ def test_speed_changes_throughput_and_rates_and_nothing_else():
 @pytest.mark.parametrize("record", ["cells", "distributions"])
 @pytest.mark.parametrize("cushioning", [1.0, INF])
 def test_stress_and_strength_times_8_give_the_same_product(record, cushioning):
-    scene = paper({"resolution.record": record, "material.cushioning": cushioning})
-    ore = scene.material
-    stiff = scene.with_values(
-        {
-            "material.strength": 8 * ore.strength,
-            "material.bulk_modulus": 8 * ore.bulk_modulus,
-            "material.shear_modulus": 8 * ore.shear_modulus,
-        }
-    )
+    scene = paper({"resolution.record": record, "strength.cushioning": cushioning})
+    names = ("strength.reference_strength", "elasticity.bulk_modulus", "elasticity.shear_modulus")
+    known = values_of(scene)
+    stiff = scene.with_values({name: 8 * known[name] for name in names})
     first, second = simulate(scene), simulate(stiff)
     stresses = {name for name in first.data_vars if schema.VARIABLES[name].units == "Pa"}
     stresses |= {"pressing_force", "torque", "power", "specific_energy"}  # all in proportion to stress
@@ -211,8 +212,8 @@ def test_sizes_times_4_with_their_scale_give_sizes_times_4():
         {
             "feed.bottom_size": 4 * scene.feed.bottom_size,
             "feed.top_size": 4 * scene.feed.top_size,
-            "material.strength_size": 4 * scene.material.strength_size,
-            "material.size_floor": 4 * scene.material.size_floor,
+            "strength.reference_size": 4 * scene.strength.reference_size,
+            "fragments.size_floor": 4 * scene.fragments.size_floor,
         }
     )
     first, second = simulate(scene), simulate(coarse)
@@ -222,8 +223,8 @@ def test_sizes_times_4_with_their_scale_give_sizes_times_4():
 
 
 def test_one_cell_has_no_cushion():
-    one = {"resolution.cells": 1, "resolution.photographs": 20}
-    cushioned, free = simulate(paper(one)), simulate(paper(one | {"material.cushioning": INF}))
+    one = {"resolution.cells": 1, "resolution.snapshots": 20}
+    cushioned, free = simulate(paper(one)), simulate(paper(one | {"strength.cushioning": INF}))
     assert same_bits(cushioned, free, SIZES)
     assert "few_cells" not in flags(cushioned)
 
@@ -232,42 +233,44 @@ def test_one_cell_has_no_cushion():
 
 
 def test_equal_gaps_give_the_feed_bit_for_bit():
-    scene = paper(EQUAL_GAPS | {"resolution.photographs": 2})
+    scene = paper(EQUAL_GAPS | {"resolution.snapshots": 2})
     ds = simulate(scene)
     assert np.array_equal(product_sizes(ds), feed_sizes(scene))
     assert not ds["pressure"].any()
     assert {"no_compaction", "no_breakage"} <= flags(ds)
-    assert "no_compaction: the gap equals the entry gap" in ds.attrs["notes"]
+    assert "no_compaction: the gap equals the entry gap" in ds.attrs["diagnostics"]
     for name in ds.variables:
         assert np.all(np.isfinite(ds[name])), name
 
 
 @pytest.mark.parametrize("record", ["distributions", "product"])
-@pytest.mark.parametrize("values", [EQUAL_GAPS, {"material.strength": 1e15}], ids=["equal gaps", "strong ore"])
+@pytest.mark.parametrize(
+    "values", [EQUAL_GAPS, {"strength.reference_strength": 1e15}], ids=["equal gaps", "strong ore"]
+)
 def test_closed_form_gives_the_feed_where_nothing_breaks(values, record):
-    scene = paper(values | {"material.cushioning": INF, "resolution.record": record})
+    scene = paper(values | {"strength.cushioning": INF, "resolution.record": record})
     ds = simulate(scene)
     assert "no_breakage" in flags(ds)
-    exact = feed.passing(scene.feed, ds["sieve"].values).astype(np.float32)
+    exact = scene.feed.passing(ds["sieve"].values).astype(np.float32)
     assert np.array_equal(ds["passing_total"], exact)
-    assert float(ds["p80_total"]) == pytest.approx(float(feed.quantile(scene.feed, 0.8)), rel=1e-6)
+    assert float(ds["p80_total"]) == pytest.approx(float(scene.feed.quantile(0.8)), rel=1e-6)
 
 
 def test_strength_above_every_stress_gives_the_feed_bit_for_bit():
-    scene = paper({"material.strength": 1e15})
+    scene = paper({"strength.reference_strength": 1e15})
     ds = simulate(scene)
     assert np.array_equal(product_sizes(ds), feed_sizes(scene))
     assert flags(ds) == {"no_breakage", "solid_fraction_capped", "unusual_machine"}  # rolls of 6 m
-    assert "no_breakage: no grain broke: the product is the feed" in ds.attrs["notes"]
+    assert "no_breakage: no grain broke: the product is the feed" in ds.attrs["diagnostics"]
     assert not ds["breaks_per_cell"].any()
 
 
 def test_exit_solid_fraction_above_its_limit_is_flagged_with_the_figure():
     ds = simulate(presets.paper().with_values({"resolution.cells": 0}))
     assert "solid_fraction_capped" in flags(ds)
-    assert "a solid fraction of 1.68 at the exit; held at max_solid_fraction 0.9" in ds.attrs["notes"]
+    assert "a solid fraction of 1.68 at the exit; held at max_solid_fraction 0.9" in ds.attrs["diagnostics"]
     assert float(ds["continuity_solid_fraction"].max()) == pytest.approx(1.68, abs=0.01)
-    loose = simulate(paper({"resolution.cells": 0, "material.feed_solid_fraction": 0.3}))
+    loose = simulate(paper({"resolution.cells": 0, "bed.feed_solid_fraction": 0.3}))
     assert "solid_fraction_capped" not in flags(loose)
 
 
@@ -275,7 +278,7 @@ def test_top_size_far_above_the_gap_is_flagged():
     for gap, flagged in ((0.041, False), (0.039, True)):
         ds = simulate(paper({"rolls.gap": gap, "resolution.cells": 0}))
         assert ("single_particle_nipping" in flags(ds)) is flagged
-    assert "top size is 1.54 gaps; above 1.5" in ds.attrs["notes"]
+    assert "top size is 1.54 gaps; above 1.5" in ds.attrs["diagnostics"]
 
 
 @pytest.mark.parametrize(("cells", "flagged"), [(1, False), (2, True), (3, True), (4, False)])
@@ -284,28 +287,28 @@ def test_two_or_three_cells_are_flagged(cells, flagged):
 
 
 def test_cushioning_too_weak_to_square_is_none():
-    assert same_bits(*(simulate(paper({"material.cushioning": n})) for n in (1e300, INF)))
+    assert same_bits(*(simulate(paper({"strength.cushioning": n})) for n in (1e300, INF)))
 
 
 def test_tension_is_flagged():
-    ds = simulate(paper({"resolution.cells": 0, "material.elastic_exponent": -0.5}))
+    ds = simulate(paper({"resolution.cells": 0, "elasticity.exponent": -0.5}))
     assert {"tension_clamped", "no_limit_of_steps"} <= flags(ds)
-    assert "need not converge" in ds.attrs["notes"]
-    assert "no_limit_of_steps" not in flags(simulate(paper({"resolution.cells": 0, "material.elastic_exponent": 0.0})))
+    assert "need not converge" in ds.attrs["diagnostics"]
+    assert "no_limit_of_steps" not in flags(simulate(paper({"resolution.cells": 0, "elasticity.exponent": 0.0})))
     assert np.all(ds["pressure"] >= 0)
 
 
 def test_grains_below_the_floor_are_counted_and_flagged():
-    ds = simulate(paper({"material.size_floor": "1 mm"}))
+    ds = simulate(paper({"fragments.size_floor": "1 mm"}))
     share = np.mean(product_sizes(ds)[0] < 0.001, axis=1)
     assert np.array_equal(ds["below_floor"].values, share.astype(np.float32))
     assert "size_floor_reached" in flags(ds)
-    assert f"{share.mean():.3g} of the product is below the size floor" in ds.attrs["notes"]
+    assert f"{share.mean():.3g} of the product is below the size floor" in ds.attrs["diagnostics"]
 
 
 def test_hundreds_of_breaks_stop_at_the_floor():
     """Every step breaks every grain: sizes end below the floor, one fragment deep, and are normal numbers."""
-    values = {"material.weibull_modulus": INF, "material.cushioning": INF, "material.strength": 1.0}
+    values = {"strength.weibull_modulus": INF, "strength.cushioning": INF, "strength.reference_strength": 1.0}
     ds = simulate(paper(values | {"resolution.points": 601, "resolution.cells": 32}))
     found = product_sizes(ds)
     assert np.all(found < 1e-6)
@@ -324,16 +327,16 @@ def test_no_size_effect_and_no_cushion_break_everything_in_step(gamma):
 
     cells = sized(5000, 1000)
     values = {
-        "material.weibull_modulus": INF,
-        "material.cushioning": INF,
-        "material.strength": 1.0,
-        "material.size_floor": 1e-9,
-        "material.fragment_exponent": gamma,
+        "strength.weibull_modulus": INF,
+        "strength.cushioning": INF,
+        "strength.reference_strength": 1.0,
+        "fragments.size_floor": 1e-9,
+        "fragments.exponent": gamma,
         "resolution.streamlines": 1,
         "resolution.points": 16,
         "resolution.cells": cells,
     }
-    ds = simulate(paper(values | feed_values(kind="single", size=0.06)))
+    ds = simulate(paper(values | {"feed": {"kind": "single", "size": 0.06}}))
     compacting = (ds["volumetric_strain_rate"] > 0) & (ds["pressure"] > 1)
     steps = int(compacting.sum())
     assert steps == 3
@@ -343,9 +346,9 @@ def test_no_size_effect_and_no_cushion_break_everything_in_step(gamma):
 
 
 def test_tiny_gamma_makes_dust_and_huge_gamma_barely_chips():
-    dust = simulate(paper({"material.fragment_exponent": 1e-3}))
+    dust = simulate(paper({"fragments.exponent": 1e-3}))
     assert np.median(product_sizes(dust)) < 1e-6
-    chips = simulate(paper({"material.fragment_exponent": 1e6}))
+    chips = simulate(paper({"fragments.exponent": 1e6}))
     start = feed_sizes(paper())
     assert np.all(product_sizes(chips) > 0.99 * start)
     assert chips["breaks_per_cell"].values.min() > 1
@@ -355,9 +358,9 @@ def test_too_many_cells_are_refused_before_anything_is_computed(monkeypatch):
     def refuse(*args, **kwargs):
         raise AssertionError("computed")
 
-    monkeypatch.setattr(geometry, "bed", refuse)
+    monkeypatch.setattr(loaded, "load_bed", refuse)
     scene = paper({"resolution.cells": 2_000_000_000, "resolution.points": 100_000})
-    with pytest.raises(MemoryError, match=f"predicted {budget.predict(scene).bytes:,} bytes"):
+    with pytest.raises(MemoryError, match=f"predicted {cost.predict(scene).bytes:,} bytes"):
         simulate(scene)
 
 
@@ -370,8 +373,8 @@ def test_single_feed_passes_the_sieve_of_its_own_size():
     """Cells are float32, and float32(0.1) > 0.1: the grain must still pass the 100 mm sieve."""
     for cushioning in (1.0, INF):
         scene = paper(
-            feed_values(kind="single", size=0.1)
-            | {"material.strength": 1e15, "material.cushioning": cushioning, "resolution.record": "product"}
+            {"feed": {"kind": "single", "size": 0.1}}
+            | {"strength.reference_strength": 1e15, "strength.cushioning": cushioning, "resolution.record": "product"}
         )
         assert float(hpgr.passing(simulate(scene), [0.1], total=True)[0]) == 1
 
@@ -385,13 +388,9 @@ def test_stress_only_does_no_cell_work(monkeypatch):
     def refuse(*args, **kwargs):
         raise AssertionError("cell work")
 
-    for room, name in (
-        (kernels, "march_parcels"),
-        (kernels, "start_parcels"),
-        (feed, "quantile"),
-        (limits, "critical_size"),
-    ):
-        monkeypatch.setattr(room, name, refuse)
+    monkeypatch.setattr(kernels, "march_parcels", refuse)
+    monkeypatch.setattr(kernels, "start_parcels", refuse)
+    monkeypatch.setattr(closed_form, "critical_size", refuse)
     ds = simulate(paper({"resolution.cells": 0}))
     cells_only = {name for name, entry in schema.VARIABLES.items() if {"cell", "sieve"} & set(entry.dims)}
     assert not cells_only & set(ds.variables)
@@ -402,7 +401,7 @@ def test_stress_only_does_no_cell_work(monkeypatch):
 
 
 def test_product_record_keeps_nothing_else():
-    ds = simulate(paper({"resolution.record": "product", "resolution.photographs": 3}))
+    ds = simulate(paper({"resolution.record": "product", "resolution.snapshots": 3}))
     assert {"cell", "time"}.isdisjoint(ds.dims)
     assert ds["passing"].dims == ("streamline", "sieve")
 
@@ -418,8 +417,8 @@ def test_product_record_keeps_nothing_else():
         (INF, "distributions"),
     ],
 )
-def test_several_photographs_in_every_record(cushioning, record):
-    scene = paper({"resolution.record": record, "resolution.photographs": 3, "material.cushioning": cushioning})
+def test_several_snapshots_in_every_record(cushioning, record):
+    scene = paper({"resolution.record": record, "resolution.snapshots": 3, "strength.cushioning": cushioning})
     ds = simulate(scene)
     if solve.choose(scene) == "march" and record != "product":
         assert ds.sizes["time"] == 3
@@ -434,7 +433,7 @@ def test_substeps_refine_the_stress_and_keep_the_points(values):
     """Strains of 61 points with 20 substeps are those of 1201 points."""
     values = values | {"resolution.cells": 0}
     coarse = simulate(paper(values))
-    refined = simulate(paper(values | {"stress.substeps": 20}))
+    refined = simulate(paper(values | {"elasticity.substeps": 20}))
     fine = simulate(paper(values | {"resolution.points": 1201}))
     assert refined.sizes == coarse.sizes
     for name in ("x", "height", "residence_time", "speed", "volumetric_strain_rate"):
@@ -445,7 +444,7 @@ def test_substeps_refine_the_stress_and_keep_the_points(values):
 
 
 def test_crushing_takes_one_step_per_point_whatever_the_substeps():
-    ds = simulate(paper({"stress.substeps": 5}))
+    ds = simulate(paper({"elasticity.substeps": 5}))
     assert ds["size"].dims == ("time", "streamline", "point", "cell")
     assert ds.sizes["point"] == 61
 
@@ -456,14 +455,14 @@ def test_crushing_takes_one_step_per_point_whatever_the_substeps():
 def test_coordinates_are_those_of_the_motion():
     scene = paper()
     ds = simulate(scene)
-    bed = geometry.bed(scene.rolls, 3)
-    motion = flow.move(scene, bed, 61)
+    _, bed = load(scene)
+    motion = bed.kinematics
     assert np.array_equal(ds["x"], motion.x)
     assert np.array_equal(ds["height"], motion.y)
     assert np.array_equal(ds["residence_time"], np.tile(motion.residence_time, (3, 1)))
-    assert np.array_equal(ds["xi"], bed.xi)
+    assert np.array_equal(ds["xi"], bed.geometry.xi)
     assert ds.attrs["time_step_s"] == motion.time_step
-    assert ds.attrs["streamline_deviation_m"] == bed.deviation()
+    assert ds.attrs["streamline_deviation_m"] == bed.geometry.deviation()
 
 
 def test_attributes_tell_how_it_was_made():
@@ -476,10 +475,10 @@ def test_attributes_tell_how_it_was_made():
     assert again.identical(ds)
 
 
-@pytest.mark.parametrize("name", presets.PRESETS)
+@pytest.mark.parametrize("name", presets.NAMES)
 def test_every_preset_runs(name):
     small = {"resolution.streamlines": 2, "resolution.points": 41, "resolution.cells": 50}
-    ds = simulate(presets.PRESETS[name]().with_values(small))
+    ds = simulate(Scene.preset(name).with_values(small))
     assert 0 < float(ds["p80_total"]) < 0.06
     assert float(ds["peak_pressure"]) > 1e6
 

@@ -6,50 +6,50 @@ from pathlib import Path
 import pytest
 from support import paper, sized
 
-from hpgr import budget, simulate
+from hpgr import cost, simulate
 
 
 @pytest.mark.parametrize("record", ["cells", "distributions", "product", "stress only"])
 @pytest.mark.parametrize("substeps", [1, 4])
 def test_prediction_covers_the_result(record, substeps):
     values = {"resolution.cells": 0} if record == "stress only" else {"resolution.record": record}
-    scene = paper(values | {"resolution.photographs": 2})
-    cost = budget.predict(scene.with_values({"stress.substeps": substeps}))
-    assert cost.bytes >= simulate(scene).nbytes * 0.9  # sieves, scalars and labels are not counted
-    assert cost.seconds > 0
+    scene = paper(values | {"resolution.snapshots": 2})
+    predicted = cost.predict(scene.with_values({"elasticity.substeps": substeps}))
+    assert predicted.bytes >= simulate(scene).nbytes * 0.9  # sieves, scalars and labels are not counted
+    assert predicted.seconds > 0
 
 
 def test_prediction_is_near_what_recorded_cells_take():
     scene = paper({"resolution.cells": 1000, "resolution.points": 101})
-    assert budget.predict(scene).bytes == pytest.approx(simulate(scene)["size"].nbytes, rel=0.2)
+    assert cost.predict(scene).bytes == pytest.approx(simulate(scene)["size"].nbytes, rel=0.2)
 
 
 @pytest.mark.parametrize(
-    "name", ["resolution.streamlines", "resolution.points", "resolution.cells", "resolution.photographs"]
+    "name", ["resolution.streamlines", "resolution.points", "resolution.cells", "resolution.snapshots"]
 )
 def test_cost_grows_with_every_size(name):
-    scene = paper({"resolution.photographs": 2})
-    count = {"streamlines": 3, "points": 61, "cells": 64, "photographs": 2}[name.split(".")[1]]
-    small, large = budget.predict(scene), budget.predict(scene.with_values({name: 10 * count}))
+    scene = paper({"resolution.snapshots": 2})
+    count = {"streamlines": 3, "points": 61, "cells": 64, "snapshots": 2}[name.split(".")[1]]
+    small, large = cost.predict(scene), cost.predict(scene.with_values({name: 10 * count}))
     assert large.bytes > small.bytes
     assert large.seconds > small.seconds
 
 
 def test_what_is_not_recorded_costs_less():
     costs = [
-        budget.predict(paper({"resolution.cells": 10_000, "resolution.record": record})).bytes
+        cost.predict(paper({"resolution.cells": 10_000, "resolution.record": record})).bytes
         for record in ("product", "distributions", "cells")
     ]
     assert costs == sorted(costs)
-    assert budget.predict(paper({"resolution.cells": 0})).bytes < costs[0]
+    assert cost.predict(paper({"resolution.cells": 0})).bytes < costs[0]
 
 
 def test_scene_beyond_the_memory_is_refused_with_bytes_bound_and_remedy(monkeypatch):
     scene = paper()
-    needed = budget.predict(scene).bytes
-    monkeypatch.setattr(budget, "available_memory", lambda: (needed, "physical memory"))
+    needed = cost.predict(scene).bytes
+    monkeypatch.setattr(cost, "available_memory", lambda: (needed, "physical memory"))
     with pytest.raises(MemoryError) as error:
-        budget.refuse_too_large(scene)
+        cost.refuse_too_large(scene)
     text = str(error.value)
     assert text.startswith("resolution.cells: got 64 cells x 61 points x 3 streamlines, recording cells")
     for words in (
@@ -58,8 +58,8 @@ def test_scene_beyond_the_memory_is_refused_with_bytes_bound_and_remedy(monkeypa
         "record 'product'",
     ):
         assert words in text
-    monkeypatch.setattr(budget, "available_memory", lambda: (2 * needed, "physical memory"))
-    budget.refuse_too_large(scene)
+    monkeypatch.setattr(cost, "available_memory", lambda: (2 * needed, "physical memory"))
+    cost.refuse_too_large(scene)
 
 
 def test_largest_scene_is_refused():
@@ -67,19 +67,19 @@ def test_largest_scene_is_refused():
         "resolution.streamlines": 10_000,
         "resolution.points": 10_000_000,
         "resolution.cells": 2_000_000_000,
-        "resolution.photographs": 1_000_000,
-        "stress.substeps": 10_000,
+        "resolution.snapshots": 1_000_000,
+        "elasticity.substeps": 10_000,
     }
     for values in (largest, largest | {"resolution.cells": 0}):
         with pytest.raises(MemoryError, match="predicted"):
-            budget.refuse_too_large(paper(values))
+            cost.refuse_too_large(paper(values))
 
 
 @pytest.fixture
 def groups(monkeypatch, tmp_path):
     """Control groups of version 2 that are files of the test; return what writes one."""
-    monkeypatch.setattr(budget, "_PROCESS", tmp_path / "own")
-    monkeypatch.setattr(budget, "_CGROUPS", ((tmp_path, "memory.max", "memory.current", "inactive_file"),))
+    monkeypatch.setattr(cost, "_PROCESS", tmp_path / "own")
+    monkeypatch.setattr(cost, "_CGROUPS", ((tmp_path, "memory.max", "memory.current", "inactive_file"),))
     (tmp_path / "own").write_text("0::/job/step\n")
 
     def write(name, limit, used, cached=None):
@@ -95,60 +95,60 @@ def groups(monkeypatch, tmp_path):
 
 def test_the_tightest_of_own_and_enclosing_groups_counts(groups):
     groups("", "max", 10)
-    available, name = budget.available_memory()
+    available, name = cost.available_memory()
     assert name == "physical memory"
     assert available > 600
     groups("job/step", 5000, 400)
-    assert budget.available_memory() == (4600, "the memory limit of cgroup /job/step")
+    assert cost.available_memory() == (4600, "the memory limit of cgroup /job/step")
     groups("job", 1000, 500)
-    assert budget.available_memory() == (500, "the memory limit of cgroup /job")
+    assert cost.available_memory() == (500, "the memory limit of cgroup /job")
     groups("", 900, 500)
-    assert budget.available_memory() == (400, "the memory limit of cgroup /")
+    assert cost.available_memory() == (400, "the memory limit of cgroup /")
     groups("other", 1, 0)  # not this process's
-    assert budget.available_memory()[0] == 400
+    assert cost.available_memory()[0] == 400
 
 
 def test_cache_of_files_counts_as_free(groups):
     groups("job/step", 1000, 900, cached=700)
-    assert budget.available_memory()[0] == 800
+    assert cost.available_memory()[0] == 800
     groups("job/step", 1000, 1900, cached=0)
-    assert budget.available_memory()[0] == 0
+    assert cost.available_memory()[0] == 0
 
 
 def test_groups_of_version_1_are_found(monkeypatch, tmp_path):
-    monkeypatch.setattr(budget, "_PROCESS", tmp_path / "own")
-    monkeypatch.setattr(budget, "_CGROUPS", ((tmp_path, "limit", "used", "cache"),))
+    monkeypatch.setattr(cost, "_PROCESS", tmp_path / "own")
+    monkeypatch.setattr(cost, "_CGROUPS", ((tmp_path, "limit", "used", "cache"),))
     (tmp_path / "own").write_text("5:cpu:/elsewhere\n4:memory:/slurm/job_7\n0::/\n")
     for name, limit in {"slurm/job_7": 4000, "elsewhere": 10}.items():
         (tmp_path / name).mkdir(parents=True)
         (tmp_path / name / "limit").write_text(str(limit))
         (tmp_path / name / "used").write_text("1000")
-    assert budget.available_memory() == (3000, "the memory limit of cgroup /slurm/job_7")
+    assert cost.available_memory() == (3000, "the memory limit of cgroup /slurm/job_7")
 
 
 @pytest.mark.parametrize("own", ["0::/../..\n", None])
 def test_groups_that_cannot_be_seen_do_not_count(monkeypatch, tmp_path, own):
-    monkeypatch.setattr(budget, "_PROCESS", tmp_path / "own")
-    monkeypatch.setattr(budget, "_CGROUPS", ((tmp_path / "none", "memory.max", "memory.current", "inactive_file"),))
+    monkeypatch.setattr(cost, "_PROCESS", tmp_path / "own")
+    monkeypatch.setattr(cost, "_CGROUPS", ((tmp_path / "none", "memory.max", "memory.current", "inactive_file"),))
     if own is not None:
         (tmp_path / "own").write_text(own)
-    assert budget.available_memory()[1] == "physical memory"
+    assert cost.available_memory()[1] == "physical memory"
 
 
 def test_refusal_names_the_group_that_it_was_held_against(groups):
-    needed = budget.predict(paper()).bytes
+    needed = cost.predict(paper()).bytes
     groups("job/step", needed + 100, 100)
     with pytest.raises(MemoryError, match=f"80% of the {needed:,} bytes that the memory limit of cgroup /job/step"):
-        budget.refuse_too_large(paper())
+        cost.refuse_too_large(paper())
 
 
 def test_prediction_covers_what_a_process_takes():
     """Peak memory of a process that runs a scene, above that of one that runs the same scene with few cells."""
     script = (
-        "import resource, sys; from support import paper; from hpgr import budget, simulate\n"
+        "import resource, sys; from support import paper; from hpgr import cost, simulate\n"
         "scene = paper({'resolution.cells': int(sys.argv[1]), 'resolution.points': 101})\n"
         "simulate(scene)\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, budget.predict(scene).bytes)\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, cost.predict(scene).bytes)\n"
     )
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
 
