@@ -84,10 +84,11 @@ def parse(text: str, unit: str) -> float:
     if unit == "rad s-1" and not _ANGLE.search(named):
         raise ValueError("not a rate of turning; write it like '19 rpm' or '2 rad/s'")
     try:
-        return float((number * _registry().Unit(named)).to(known.pint).magnitude)
+        magnitude = float((number * _registry().Unit(named)).to(known.pint).magnitude)
     except (PintError, ArithmeticError, AttributeError, TypeError, ValueError, AssertionError) as error:
         fault = _FAULTS.get(type(error).__name__, "does not make a number")
         raise ValueError(f"not a quantity in {known.shown}: its unit {named!r} {fault}") from None
+    return float(f"{magnitude:.15g}")  # "13 mm" is the float 0.013, not its neighbour that 13 times 1e-3 gives
 
 
 def check_seed(name: str, value: int) -> None:

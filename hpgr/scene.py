@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import BeforeValidator, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
 from hpgr.fields import (
     Count,
@@ -415,14 +415,17 @@ class Scene(Frozen):
         if level is not None:  # what is kept of the results stays
             data["resolution"] = dict(self.resolution) | level.values()
         for name in {name.partition(".")[0] for name in values if "." in name}:
-            data[name] = dict(data.get(name) or {})
+            part = data.get(name) or {}
+            if not isinstance(part, BaseModel | Mapping):
+                continue  # refused below
+            data[name] = dict(part)
             kind = values.get(f"{name}.kind")
             law = next((law for law in _parts(name) if kind in kinds_of(law)), None)
             if law is not None:
                 data[name] = {key: value for key, value in data[name].items() if key in law.model_fields}
         for name, value in values.items():
             section, _, key = name.partition(".")
-            if key:
+            if key and isinstance(data[section], dict):
                 data[section][key] = value
         return type(self).model_validate(data)
 

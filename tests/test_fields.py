@@ -1,5 +1,6 @@
 import contextlib
 import math
+from fractions import Fraction
 
 import pytest
 from hypothesis import given
@@ -55,9 +56,27 @@ def test_any_text_gives_a_number_or_a_value_error(text):
         assert isinstance(parse(text, "m"), float)
 
 
+@pytest.mark.parametrize(
+    ("named", "unit", "per_si"),
+    [
+        ("mm", "m", 1000),
+        ("cm", "m", 100),
+        ("um", "m", 10**6),
+        ("MPa", "Pa", Fraction(1, 10**6)),
+        ("N/mm^2", "Pa", Fraction(1, 10**6)),
+        ("kN*m", "N m", Fraction(1, 1000)),
+        ("g/cm^3", "kg m-3", Fraction(1, 1000)),
+    ],
+)
+def test_text_gives_the_float_of_the_number_written_out(named, unit, per_si):
+    """Thousands of whole numbers and tenths, in every unit: text and numbers select the same place of a sweep."""
+    for tenths in [*range(1, 5000), *range(10**6, 10**6 + 50)]:
+        assert parse(f"{tenths / 10:.10g} {named}", unit) == float(Fraction(tenths, 10) / per_si)
+
+
 @given(st.floats(1e-9, 1e9))
 def test_shown_values_are_read_back(value):
-    for unit in ("m", "Pa", "rad s-1", "rad", "N m"):
+    for unit in ("m", "Pa", "rad s-1", "rad"):
         assert parse(show(value, unit), unit) == pytest.approx(value, rel=1e-5)
 
 
