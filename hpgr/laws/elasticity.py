@@ -8,13 +8,10 @@ from pydantic import Field
 
 from hpgr.fields import Count, Frozen, Number, Pascals, quantity
 
-GRANULAR = 0  # tag of the law in the kernels
-
 
 class ElasticConstants(NamedTuple):
     """A law as the kernels take it."""
 
-    law: int
     euler: bool
     largest_shear_ratio: float
     bulk_modulus: float  # Pa
@@ -102,7 +99,7 @@ class GranularElasticity(Frozen):
     def constants(self) -> ElasticConstants:
         """Return the law as the kernels take it."""
         moduli = self.bulk_modulus, self.shear_modulus, self.exponent
-        return ElasticConstants(GRANULAR, self.integrator == "euler", self.largest_shear_ratio(), *moduli)
+        return ElasticConstants(self.integrator == "euler", self.largest_shear_ratio(), *moduli)
 
 
 def _ratio(eps_s, eps_v):

@@ -1,0 +1,218 @@
+"""What the machine does to the bed: pressing force, torque, power, specific energy, and the gap that floats.
+
+Real machines set force and speed, and the gap follows (model page, section Real machines).
+"""
+
+import math
+from functools import cache, lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from hpgr.bed import kernels
+from hpgr.bed.loaded import BedInputs, Pressed, inputs_of
+from hpgr.fields import show
+from hpgr.scene import LEAST_GAP, STEEPEST_ENTRY, Scene
+
+# Usual machines and operation (design figures of makers, as collected in the mission of this package; phi ours)
+USUAL = {
+    "roll diameter": (0.5, 2.8, "m"),
+    "specific pressing force": (1e6, 9e6, "Pa"),
+    "specific energy": (3600.0, 10800.0, "J kg-1"),
+    "gap over diameter": (0.02, 0.03, "1"),
+    "exit solid fraction": (0.75, 0.92, "1"),
+}
+_NARROWEST = 1e-4  # gap over diameter below which no operating gap is looked for
+_GAP_PRECISION = 1e-9  # relative, of an operating gap
+_NO_FORCE = 1e-6  # of the wanted force; less counts as this much
+
+
+class Performance(NamedTuple):
+    """Force, torque, power and throughput of a machine of this width, under the names of the Dataset, SI units."""
+
+    pressing_force: float
+    specific_pressing_force: float
+    torque: float
+    power: float
+    specific_energy: float
+    specific_throughput: float
+    nip_angle: float
+    force_angle: float
+
+
+def performance(scene: Scene, pressed: Pressed, throughput: float) -> Performance:
+    """Return force, torque (of both drives), power and their specific figures for the whole roll width.
+
+    The force angle beta is that of sin(beta) = P / (2 F U), so that W = 2000 Fsp sin(beta) / mdot holds for
+    W in kWh/t, Fsp in N/mm2 and mdot = Q / (D L U) in t s/(h m3), as far as power goes into the bed (idle_torque = 0).
+    It is 0 where nothing is pressed.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr.bed import machine
+    >>> found = machine.performance(hpgr.presets.industrial(), machine.Pressed(8e6, 4e5, 0.159), throughput=200.0)
+    >>> round(found.specific_pressing_force / 1e6, 2), found.specific_energy  # N/mm2, J/kg
+    (3.64, 2000.0)
+    """
+    rolls = scene.rolls
+    carried = rolls.width * _mean_pressure(scene)
+    force, bed_power = pressed.force * carried, pressed.power * carried
+    power = bed_power + rolls.idle_torque * rolls.speed
+    return Performance(
+        pressing_force=force,
+        specific_pressing_force=force / (rolls.diameter * rolls.width),
+        torque=power / rolls.speed,
+        power=power,
+        specific_energy=power / throughput,
+        specific_throughput=throughput / (rolls.diameter * rolls.width * rolls.surface_speed),
+        nip_angle=pressed.nip_angle,
+        force_angle=math.asin(min(bed_power / (2 * force * rolls.surface_speed), 1.0)) if force > 0 else 0.0,
+    )
+
+
+def unusual(scene: Scene, found: Performance, exit_solid_fraction: float) -> str:
+    """Return in words what leaves the range of usual machines, or nothing.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr.bed import machine
+    >>> scene = hpgr.presets.industrial()
+    >>> found = machine.performance(scene, machine.Pressed(8e6, 4e5, 0.159), throughput=200.0)
+    >>> machine.unusual(scene, found, exit_solid_fraction=0.85)
+    'specific energy 0.5556 kWh/t (usual 1 kWh/t to 3 kWh/t)'
+    """
+    values = {
+        "roll diameter": scene.rolls.diameter,
+        "specific pressing force": found.specific_pressing_force,
+        "specific energy": found.specific_energy,
+        "gap over diameter": scene.rolls.gap / scene.rolls.diameter,
+        "exit solid fraction": exit_solid_fraction,
+    }
+    return "; ".join(
+        f"{name} {show(values[name], unit, 4)} (usual {show(low, unit)} to {show(high, unit)})"
+        for name, (low, high, unit) in USUAL.items()
+        if not low <= values[name] <= high
+    )
+
+
+def _mean_pressure(scene: Scene) -> float:
+    """Return the mean pressure over the roll width relative to that of its middle."""
+    return 1.0 if scene.roll_width is None else scene.roll_width.mean_pressure()
+
+
+def specific_pressing_force(scene: Scene) -> float:
+    """Return the specific pressing force F/(D L) of `scene` at its own gap, Pa, from the roll's streamline alone.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr.bed import machine
+    >>> 1e6 < machine.specific_pressing_force(hpgr.presets.industrial()) < 9e6
+    True
+    """
+    return _force_over_diameter(inputs_of(scene)) * _mean_pressure(scene)
+
+
+def _force_over_diameter(inputs: BedInputs) -> float:
+    roll = inputs.between_rolls(np.ones(1))
+    if roll.height == 0:
+        return 0.0
+    return kernels.force_at_roll(roll, *inputs.laws(), inputs.surface_speed, inputs.stress_points) / inputs.diameter
+
+
+def operating_gap(scene: Scene, specific_pressing_force: float | str) -> float:
+    """Return the gap in m at which the bed carries a specific pressing force F/(D L).
+
+    The nip angle is held while the gap floats: that given, or that of the cake density at the scene's own gap.
+
+    Parameters
+    ----------
+    scene : Scene
+        The machine; its gap only matters where the nip angle follows from a cake density.
+    specific_pressing_force : float or str
+        In Pa, or text with a unit.
+
+    Raises
+    ------
+    ValueError
+        If no gap carries that force; the message has the reachable range.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> scene = hpgr.presets.industrial()
+    >>> narrow, wide = (hpgr.operating_gap(scene, force) for force in ("5 N/mm^2", "3 N/mm^2"))
+    >>> 0.01 < narrow < wide < 0.1
+    True
+    """
+    held = scene.with_values({"rolls.specific_pressing_force": specific_pressing_force})
+    return float_gap(held).rolls.gap
+
+
+def float_gap(scene: Scene) -> Scene:
+    """Return the scene with the gap at which its specific pressing force is carried; as it is if it has none.
+
+    Raises
+    ------
+    ValueError
+        If no gap carries that force.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> from hpgr.bed import machine
+    >>> scene = hpgr.presets.industrial().with_values({"rolls.specific_pressing_force": "4 N/mm^2"})
+    >>> round(machine.float_gap(scene).rolls.gap, 4)
+    0.0538
+    """
+    wanted = scene.rolls.specific_pressing_force
+    if wanted is None:
+        return scene
+    flow = scene.flow.held(scene.rolls.gap, scene.rolls.diameter, scene.bed.feed_solid_fraction)
+    gap = _gap_carrying(inputs_of(scene)._replace(gap=0.0, flow=flow), wanted, _mean_pressure(scene))
+    # copies skip validation, which would cost more than the root: its bounds are a scene's
+    return scene.model_copy(update={"rolls": scene.rolls.model_copy(update={"gap": gap}), "flow": flow})
+
+
+@lru_cache(256)
+def _gap_carrying(inputs: BedInputs, wanted: float, mean_pressure: float) -> float:
+    """Return the gap at which a bed carries the specific pressing force `wanted`, Pa; the gap of `inputs` is unused."""
+    from scipy.optimize import brentq  # late: loading it takes as long as a hundred gaps
+
+    narrow, below = _narrowest(inputs)
+    wide = inputs.flow.widest_gap(inputs.diameter, inputs.entry_gap)
+
+    def force(gap: float) -> float:
+        return _force_over_diameter(inputs._replace(gap=gap)) * mean_pressure
+
+    @cache
+    def excess(log_gap: float) -> float:  # nearly straight in logs; without any force it is far below
+        return math.log(max(force(math.exp(log_gap)) / wanted, _NO_FORCE))
+
+    if narrow >= wide:
+        raise ValueError(
+            f"rolls.entry_gap: got {show(inputs.entry_gap, 'm')}; must be above "
+            f"{show(inputs.entry_gap + narrow - wide, 'm')} for the gap to float below it, the narrowest gap being "
+            f"{show(narrow, 'm')}, below which {below}; begin the bed higher"
+        )
+    ends = math.log(narrow), math.log(wide)
+    if not excess(ends[0]) >= 0 >= excess(ends[1]):
+        raise ValueError(
+            f"rolls.specific_pressing_force: got {show(wanted, 'Pa')}; must lie within the reachable "
+            f"{show(force(wide), 'Pa')} (gap {show(wide, 'm')}) to {show(force(narrow), 'Pa')} (gap "
+            f"{show(narrow, 'm')}, below which {below}); choose a force within, or another bulk modulus, nip angle "
+            "or entry gap"
+        )
+    return math.exp(brentq(excess, *ends, xtol=_GAP_PRECISION, rtol=4 * np.finfo(float).eps))
+
+
+def _narrowest(inputs: BedInputs) -> tuple[float, str]:
+    """Return the narrowest gap that can be, and what is below it."""
+    steepest = inputs.entry_gap - 0.9998 * STEEPEST_ENTRY * inputs.diameter
+    return max(
+        (max(_NARROWEST * inputs.diameter, LEAST_GAP), "no operating gap is looked for"),
+        (steepest, "the bed would begin above 60 degrees, where a cubic streamline turns back"),
+        inputs.flow.narrowest_gap(inputs.diameter, inputs.feed_solid_fraction),
+    )
