@@ -56,8 +56,8 @@ def _lines(path: str | Path) -> list[tuple[int, list[str]]]:
     kept = [(n, line) for n, line in enumerate(text.splitlines(), start=1) if not line.lstrip().startswith("#")]
     if max((len(line) for _, line in kept), default=0) > _LONGEST_LINE or len(kept) > _MOST_LINES:
         raise ValueError(
-            f"{path}: got {len(kept):,} lines; a table has at most {_MOST_LINES:,} lines of {_LONGEST_LINE:,} characters; "
-            "give the table alone"
+            f"{path}: got {len(kept):,} lines; a table has at most {_MOST_LINES:,} lines of {_LONGEST_LINE:,} "
+            "characters; give the table alone"
         )
     lines = [(n, [cell.strip() for cell in next(csv.reader([line]), [])]) for n, line in kept]
     lines = [(n, cells) for n, cells in lines if any(cells)]

@@ -11,7 +11,7 @@ from support import KS, first_cells, ks_distance, paper, sized
 import hpgr
 from hpgr import Scene, cost, presets, simulate
 from hpgr.bed import loaded
-from hpgr.fields import values_of
+from hpgr.fields import parts_of, values_of
 from hpgr.grains import closed_form, kernels, solve
 from hpgr.results import flags as limits
 from hpgr.results import schema
@@ -447,6 +447,103 @@ def test_crushing_takes_one_step_per_point_whatever_the_substeps():
     ds = simulate(paper({"elasticity.substeps": 5}))
     assert ds["size"].dims == ("time", "streamline", "point", "cell")
     assert ds.sizes["point"] == 61
+
+
+# --- the one door ------------------------------------------------------------------------------------------
+
+HELD = {"rolls.specific_pressing_force": "4 N/mm^2", "resolution.cells": 0}
+
+
+def test_every_caller_runs_the_machine_whose_gap_carries_the_force():
+    """55.0 mm and 3.83 N/mm2 are the machine as given; 53.7 mm carries 4.00."""
+    from hpgr import tolerance
+    from studies.sweep import sweep
+
+    scene = presets.industrial().with_values(HELD)
+    result = run_scene(scene)
+    assert result.scene.rolls.gap == pytest.approx(53.7e-3, abs=0.06e-3)
+    assert result.scene.rolls.gap == hpgr.operating_gap(scene, 4e6)
+    assert float(result.values["specific_pressing_force"]) == pytest.approx(4e6, rel=1e-6)
+    given = run_scene(scene.with_values({"rolls.specific_pressing_force": None}))
+    assert float(given.values["specific_pressing_force"]) == pytest.approx(3.83e6, rel=5e-3)
+    swept = sweep(scene, {"rolls.speed": [scene.rolls.speed]}, progress=False).isel(rolls_speed=0, replicate=0)
+    refined = simulate(scene, tolerance=0.05)
+    for found in (simulate(scene), swept, refined):
+        assert float(found["specific_pressing_force"]) == pytest.approx(4e6, rel=1e-6)
+    assert float(swept["operating_gap"]) == np.float32(result.scene.rolls.gap)
+    assert tolerance.refine(scene, 0.05).scene.rolls.gap == scene.rolls.gap  # floated when it is run
+
+
+def test_loading_a_floated_scene_again_changes_nothing():
+    scene, bed = load(presets.industrial().with_values(HELD))
+    again, same = load(scene)
+    assert again == scene
+    assert np.array_equal(same.stress.pressure, bed.stress.pressure)
+
+
+SMALL = {"resolution.streamlines": 2, "resolution.points": 31, "resolution.cells": 20, "resolution.snapshots": 2}
+BASES = {
+    "exchange": SMALL
+    | {"exchange": {"record_startup": True, "interval": 7}, "resolution.record": "distributions"}
+    | {"fragments.size_floor": "2 mm"},
+    "nip": SMALL | {"flow": {"kind": "nip", "nip_angle": "12 deg"}, "rolls.specific_pressing_force": "0.3 N/mm^2"},
+    "cake": SMALL | {"flow": {"kind": "nip", "cake_solid_fraction": 0.8}},
+    "width": SMALL | {"roll_width": {"slices": 2}, "resolution.record": "product"},
+    "single": SMALL | {"feed": {"kind": "single", "size": "40 mm"}},
+    "power": SMALL | {"feed": {"kind": "power_law", "top_size": "60 mm", "exponent": 0.7}},
+    "weibull": SMALL | {"feed": {"kind": "rosin_rammler", "size": "30 mm", "exponent": 1.2, "top_size": "60 mm"}},
+    "table": SMALL | {"feed": {"kind": "table", "table": ((0.001, 0.0), (0.05, 100.0)), "top_size": "40 mm"}},
+}
+OTHER = {
+    "elasticity.integrator": "euler",
+    "strength.stress": "major",
+    "exchange.start": "crushed",
+    "exchange.record_startup": False,
+    "feed.table": ((0.002, 0.0), (0.05, 100.0)),
+    "resolution.sieves": (0.001, 0.01, 0.1),
+    "remark": "other",
+    "rolls.entry_gap": 1.1,
+}
+OF_THE_BED = {"diameter", "gap", "entry_gap", "speed", "feed_solid_fraction", "max_solid_fraction", "streamlines"}
+MAY_NOT_MATTER = {"remark"}
+
+
+def other_value(name, value):
+    if name == "resolution.record":
+        return "cells" if value == "distributions" else None
+    if name in OTHER or isinstance(value, str | None):
+        return OTHER.get(name)
+    return value + 1 if isinstance(value, int) else 0.95 * value or 5.0
+
+
+def test_no_field_of_a_scene_is_forgotten():
+    """Each is changed in turn: bed, address of a finished case, and result react, unless it is of those listed."""
+    from studies.sweep.cases import Addresses
+    from studies.sweep.space import SweepSpec
+
+    seen, mattered = set(), set()
+    for values in BASES.values():
+        base = presets.paper().with_values(values)
+        first, address = run_scene(base), Addresses(SweepSpec(base)).of({}, 0)
+        for name, value in values_of(base).items():
+            other = other_value(name, value)
+            seen.add(name)
+            if other is None:
+                continue
+            changed = base.with_values({name: other})
+            assert (Addresses(SweepSpec(changed)).of({}, 0) != address) is (name != "remark"), name
+            found = run_scene(changed)
+            section, _, key = name.partition(".")
+            bed = section in {"flow", "elasticity"} or key in OF_THE_BED | {"points"}
+            if base.rolls.specific_pressing_force is None:  # else the gap floats with what is not of the bed, too
+                same = loaded.inputs_of(changed, True) == loaded.inputs_of(base, True)
+                assert same is not bed, name
+            if any(not np.array_equal(first.values.get(k), found.values.get(k)) for k in first.values | found.values):
+                mattered.add(name)
+    assert seen - mattered == MAY_NOT_MATTER | {name for name in seen if name.endswith(".kind")}
+    fields = {f"{section}.{key}" for section, field in Scene.model_fields.items() for part in parts_of(field)
+              for key in part.model_fields}  # fmt: skip
+    assert seen == fields | {"remark"} | ({"exchange", "roll_width"} & seen)
 
 
 # --- the whole ---------------------------------------------------------------------------------------------

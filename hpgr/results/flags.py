@@ -6,11 +6,19 @@ from typing import NamedTuple
 import numpy as np
 
 from hpgr.bed.loaded import LoadedBed
-from hpgr.bed.machine import USUAL, Performance
+from hpgr.bed.machine import Performance
 from hpgr.fields import show
 from hpgr.grains.solve import Crushed
 from hpgr.scene import Scene
 
+# Usual machines and operation (design figures of makers, as collected in the mission of this package; phi ours)
+USUAL = {
+    "roll diameter": (0.5, 2.8, "m"),
+    "specific pressing force": (1e6, 9e6, "Pa"),
+    "specific energy": (3600.0, 10800.0, "J kg-1"),
+    "gap over diameter": (0.02, 0.03, "1"),
+    "exit solid fraction": (0.75, 0.92, "1"),
+}
 _NIPPING = 1.5  # top size over gap above which rolls nip single grains, which is not modelled
 
 

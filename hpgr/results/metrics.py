@@ -22,8 +22,8 @@ def passing(dataset: xr.Dataset, sieves=None, point: int = -1, total: bool = Fal
     dataset : xarray.Dataset
         From `hpgr.simulate` or a study.
     sieves : array_like, optional
-        Sizes in m, or texts with a unit; default the recorded sieves. From recorded cells any size is exact; otherwise sizes
-        between sieves are interpolated linearly in log size.
+        Sizes in m, or texts with a unit; default the recorded sieves. From recorded cells any size is exact;
+        otherwise sizes between sieves are interpolated linearly in log size.
     point : int
         Material point; the default is the exit. Others need recorded cells or distributions.
     total : bool
