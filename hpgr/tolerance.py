@@ -84,15 +84,32 @@ def refine(scene: Scene, tolerance: float, max_cost: float = 60.0, seed: int = 0
     coarse, bias_steps, scatter = _enough_points(coarse, tolerance / 2, spent, seed)
     bias = {name: bias_lines[name] + bias_steps[name] for name in bias_steps}
     cells = coarse.resolution.cells
-    if scatter:
-        room = {name: (tolerance - bias[name]) / 2 for name in scatter}
-        factor = max((_NOISE_SAFETY * scatter[name] / room[name]) ** 2 for name in scatter)
-        cells = max(100, math.ceil(cells * factor))
+    for name, found in scatter.items():
+        cells = max(cells, found.cells_for((tolerance - bias[name]) / 2))
     chosen = coarse.with_values({"resolution.cells": cells, **kept})
-    shrink = math.sqrt(coarse.resolution.cells / cells) if cells else 0.0
-    noise = {name: _NOISE_SAFETY * scatter.get(name, 0.0) * shrink for name in bias}
+    noise = {name: scatter[name].noise(cells) if name in scatter else 0.0 for name in bias}
     spent.allow(cost.predict(chosen).seconds, chosen)
     return Estimate(chosen, bias, noise)
+
+
+class _Scatter(NamedTuple):
+    """Relative scatter of a figure: variance over cells of what breaks at random, and error of counting whole cells.
+
+    A parcel of feed has a cell in each of M equal parts of its mass, so that its number of cells below a sieve is right
+    to one cell, which is there or not: a standard deviation of at most 1/2 cell, whatever the other cells tell of it.
+    """
+
+    variance: float
+    counting: float
+
+    def noise(self, cells: int) -> float:
+        """Return one standard error of a run with so many cells."""
+        return math.sqrt(self.variance / cells + (self.counting / cells) ** 2)
+
+    def cells_for(self, noise: float) -> int:
+        """Return how many cells make the standard error this small."""
+        half = self.variance / (2 * noise**2)
+        return math.ceil(half + math.sqrt(half**2 + (self.counting / noise) ** 2))
 
 
 class _Purse:
@@ -127,7 +144,7 @@ def _enough_streamlines(scene: Scene, wanted: float, spent: _Purse) -> tuple[Sce
 
 
 def _enough_points(scene: Scene, wanted: float, spent: _Purse, seed: int):
-    """Return the scene with enough points and pilot cells, the bias they leave, and the scatter of one pilot run.
+    """Return the scene with enough points and pilot cells, the bias they leave, and the scatter of a run of it.
 
     The bias has two parts. Sampling the stress at points misses the sharp peak by an amount that depends on where
     the points happen to lie; it is read off a much finer bed. Breaking once per step is what remains: its bias
@@ -153,7 +170,7 @@ def _enough_points(scene: Scene, wanted: float, spent: _Purse, seed: int):
                 stepping = {name: _left(steps[name], earlier[name]) for name in steps}
                 bias = {name: sampling.get(name, 0.0) + stepping.get(name, 0.0) for name in QUANTITIES}
                 if max(bias.values()) <= wanted:
-                    return one, bias, _scatter(runs[-1])
+                    return one, bias, _scatter(runs[-1], one)
             earlier = steps
         points = 2 * points - 1
 
@@ -193,13 +210,15 @@ def _left(step: tuple[float, float], earlier: tuple[float, float]) -> float:
     return (abs(change) + error) * ratio / (1 - ratio)
 
 
-def _scatter(runs: list[dict]) -> dict[str, float]:
-    """Return the relative standard deviation of one run, by quantity."""
-    found = {}
+def _scatter(runs: list[dict], scene: Scene) -> dict[str, _Scatter]:
+    """Return the scatter of one run of `scene`, by quantity."""
+    grid, found = scene.resolution, {}
     for name in runs[0]:
         values = np.array([run[name] for run in runs])
         scale = max(abs(values.mean()), _LEAST_FINENESS if name == "fineness" else 1e-300)
-        found[name] = float(values.std(ddof=1)) / scale
+        spread = _NOISE_SAFETY * float(values.std(ddof=1)) / scale
+        counting = 0.5 / scale / math.sqrt(grid.streamlines) if name == "fineness" else 0.0
+        found[name] = _Scatter(grid.cells * spread**2, counting)
     return found
 
 

@@ -13,9 +13,9 @@ from support import paper
 from test_accuracy import TINY
 
 import hpgr
-from studies import accuracy, store
+from studies import accuracy
 from studies import paper as figures
-from studies.sweep import sweep
+from studies.sweep import netcdf, sweep
 
 CHECKER = find_spec("compliance_checker") is not None
 NO_CHECKER = "the compliance checker is not installed (pip install '.[cf]')"
@@ -43,16 +43,16 @@ print(json.dumps(found))
 
 def datasets():
     small = {"resolution.streamlines": 2, "resolution.points": 21, "resolution.cells": 30}
-    exchange = {"resolution.record": "distributions", "resolution.photographs": 2, "exchange.record_startup": True}
+    exchange = {"resolution.record": "distributions", "resolution.snapshots": 2, "exchange.record_startup": True}
     return {
         "cells": hpgr.simulate(paper(small)),
         "distributions": hpgr.simulate(paper(small | exchange)),
         "stress": hpgr.simulate(paper(small | {"resolution.cells": 0})),
         "tolerance": hpgr.simulate(
-            paper({"resolution.record": "product", "material.cushioning": np.inf}), tolerance=0.1
+            paper({"resolution.record": "product", "strength.cushioning": np.inf}), tolerance=0.1
         ),
         "gap_sweep": sweep(paper(small), {"rolls.gap": [0.04, 0.06, 1.2], "feed.top_size": [0.05, 0.06]}, replicates=2),
-        "text_axis": sweep(paper(small), {"stress.integrator": ["euler", "increment"]}),
+        "text_axis": sweep(paper(small), {"elasticity.integrator": ["euler", "increment"]}),
         "paper": figures.study(paper(small), 8),
         "accuracy": accuracy.study(paper(), TINY),
     }
@@ -64,7 +64,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("files")
     for name, dataset in datasets().items():
         dataset.attrs.setdefault("history", "as the commands write it")
-        store.write_dataset(dataset, folder / f"{name}.nc")
+        netcdf.write_dataset(dataset, folder / f"{name}.nc")
     raw = hpgr.simulate(paper({"resolution.points": 11}))
     raw.to_netcdf(folder / "raw.nc", engine="netcdf4")  # with its time, which is none to the conventions
     return folder
@@ -109,12 +109,12 @@ def test_numbers_along_dimensions_are_in_order(folder):
     assert seen > 10
 
 
-def test_files_call_photographs_so(folder):
+def test_files_call_snapshots_so(folder):
     original = hpgr.simulate(paper({"resolution.streamlines": 2, "resolution.points": 21, "resolution.cells": 30}))
     with xr.open_dataset(folder / "cells.nc") as opened:
         opened.load()
     assert "time" not in opened.variables
-    xr.testing.assert_identical(opened["size"].rename(photograph="time").variable, original["size"].variable)
+    xr.testing.assert_identical(opened["size"].rename(snapshot="time").variable, original["size"].variable)
     # metrics take a file as it is
     for point in (-1, 12):
         found, exact = (hpgr.passing(one, [0.001, 0.02], point=point) for one in (opened, original))

@@ -208,9 +208,14 @@ def to_dataset(values: Mapping[str, Any], attrs: Mapping[str, Any], own: Mapping
     """
     table = {**COORDINATES, **VARIABLES, **SWEEP, **own}
     made = {
-        name: xr.Variable(table[name].dims, np.asarray(value, table[name].dtype), table[name].attributes())
+        name: xr.Variable(table[name].dims, _stored(value, table[name].dtype), table[name].attributes())
         for name, value in values.items()
         if value is not None
     }
     coords = {name: made[name] for name in made if name in COORDINATES or name in table[name].dims}
     return xr.Dataset({name: made[name] for name in made if name not in coords}, coords, attrs)
+
+
+def _stored(value: Any, dtype: type | None) -> Any:
+    """Return `value` as an array of its storage type; one of dask stays lazy."""
+    return value.astype(dtype or value.dtype) if hasattr(value, "__dask_graph__") else np.asarray(value, dtype)
