@@ -514,3 +514,7 @@ def _attributes(scene: Scene, plan: Plan, seed: int) -> dict[str, Any]:
         wall_time="bed, crushing and summary of one run, large ones on all cores; hpgr.simulate adds its Dataset",
         machine=f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
     )
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

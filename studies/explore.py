@@ -3,20 +3,14 @@
 The page holds the data and the library that draws it, and asks the network for nothing.
 """
 
-import base64
-import gzip
-import json
-import re
-from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from hpgr import units
-from studies.command import refusing, shown_as
+from hpgr import fields
+from studies.command import Overwrite, Report, Sieve, command, shown_as
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -24,35 +18,39 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Options:
-    """Options of the explorer."""
+    """Options of the explorer; the page has a slider for the sieve."""
 
     result: Annotated[Path, tyro.conf.Positional, shown_as("FILE")]
     """NetCDF file of a sweep, such as outputs/gap_sweep.nc."""
-    sieve: Annotated[str, shown_as("LENGTH")] = "1 mm"
-    """Sieve whose percent passing is shown first; the page has a slider for it."""
+    sieve: Sieve = "1 mm"
     out: Annotated[Path | None, shown_as("FILE")] = None
     """Page to write (default: beside the NetCDF file, as .html)."""
+    overwrite: Overwrite = False
 
 
-@refusing
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the page and return the exit code; `arguments` default to the command line's."""
-    options = tyro.cli(Options, prog="python -m studies.explore", description=__doc__, args=arguments)
-    try:
-        sieve = units.parse(options.sieve, "m")
-    except ValueError as error:
-        raise ValueError(f"--sieve: got {options.sieve!r}; {error}") from None
-    library = chart_library()
-    from studies import store
-    from studies.explore_data import page_data
-
+def _files(options: Options) -> list[Path]:
     out = options.out or options.result.with_suffix(".html")
     if out.suffix not in (".html", ".htm"):
         raise ValueError(f"--out: got {str(out)!r}; must end with .html, so that a browser opens it")
-    page = page_of(page_data(opened(options.result), sieve, options.result.name), library)
-    store.replace(out, lambda part: part.write_text(page, encoding="utf-8"))
-    print(f"wrote {out} ({len(page.encode()) / 1e6:.1f} MB); open it in a browser")
-    return 0
+    return [out]
+
+
+@command("explore", __doc__, files=_files)
+def main(options: Options) -> Report:
+    """Write the page of the command line."""
+    try:
+        sieve = fields.parse(options.sieve, "m")
+    except ValueError as error:
+        raise ValueError(f"--sieve: got {options.sieve!r}; {error}") from None
+    library = chart_library()
+    from studies.show.page import page_data, page_of
+
+    data = page_data(opened(options.result), sieve, options.result.name)
+
+    def write(path: Path, history: str) -> None:
+        path.write_text(page_of(data, library, history), encoding="utf-8")
+
+    return Report(["open it in a browser"], [write])
 
 
 def chart_library() -> str:
@@ -74,66 +72,22 @@ def chart_library() -> str:
 
 
 def opened(path: Path) -> "xr.Dataset":
-    """Return the Dataset of a NetCDF file, read whole.
+    """Return the Dataset of a NetCDF file that may be anybody's, read whole.
 
     Raises
     ------
     ValueError
-        If there is no such file, or it is no NetCDF file.
+        If there is no such file, or it is no NetCDF file, or one that is not safe to open.
     """
+    from studies.sweep.netcdf import open_result
+
     if not path.is_file():
         raise ValueError(f"{path}: there is no such file; make one first, such as by python -m studies.gap_sweep")
-    import xarray as xr
-
     try:
-        with xr.open_dataset(path, engine="netcdf4") as dataset:
+        with open_result(path) as dataset:
             return dataset.load()
-    except (OSError, ValueError, RuntimeError) as error:
+    except (OSError, RuntimeError) as error:
         raise ValueError(f"{path}: cannot be read as NetCDF ({error}); give a file that a study has written") from None
-
-
-def page_of(data: dict[str, Any], library: str) -> str:
-    """Return the page as text.
-
-    Parameters
-    ----------
-    data : dict
-        From `studies.explore_data.page_data`.
-    library : str
-        Source of plotly.js, which is packed to two fifths of its size; browsers since 2023 unpack it.
-
-    Examples
-    --------
-    >>> from studies.explore import page_of
-    >>> "<title>a &lt; b" in page_of({"name": "a < b"}, "")
-    True
-    """
-    packed = base64.b64encode(gzip.compress(library.encode(), 9, mtime=0)).decode()
-    parts = {"TITLE": escaped(data["name"]), "DATA": embedded(data), "LIBRARY": packed}
-    template = (files("studies") / "explore_page.html").read_text(encoding="utf-8")
-    return re.sub("@@([A-Z]+)@@", lambda found: parts[found[1]], template)
-
-
-def escaped(text: str) -> str:
-    """Return text as it is written in HTML."""
-    import html
-
-    return html.escape(text)
-
-
-def embedded(data: dict[str, Any]) -> str:
-    r"""Return data as JSON that no text in it can end the script element of.
-
-    Examples
-    --------
-    >>> from studies.explore import embedded
-    >>> embedded({"note": "</script>"})
-    '{"note":"\\u003c/script\\u003e"}'
-    """
-    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    for mark in "<>&\u2028\u2029":
-        text = text.replace(mark, f"\\u{ord(mark):04x}")
-    return text
 
 
 if __name__ == "__main__":

@@ -1,21 +1,33 @@
 """The paper's figures 3a-d, 4a-c and 5, and how the bed fills: `python -m studies.paper`.
 
-Everything drawn is in one NetCDF file, mirrored: both halves of the gap, from the left roll to the right one.
+Everything drawn is in one NetCDF file, mirrored: both halves of the gap, from the left roll to the right one. Where the
+scene has a pressing force, all is drawn at the gap that carries it.
 """
 
-import shlex
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import tyro
 
-from hpgr.keys import refuse_key
+from hpgr.fields import values_of
 from hpgr.scene import Scene
-from studies.command import base_scene, refusing, shown_as
+from studies.command import (
+    Cells,
+    Exchange,
+    Level,
+    Overwrite,
+    Points,
+    Report,
+    SceneName,
+    Seed,
+    Streamlines,
+    base_scene,
+    command,
+    figure,
+    shown_as,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -23,7 +35,7 @@ if TYPE_CHECKING:
 FIGURES = ("paper_figure3.png", "paper_figure4.png", "paper_figure5.png")
 ANIMATION = "paper_startup.gif"
 
-_FRAMES = 80  # photographs of the start-up at most, about
+_FRAMES = 80  # snapshots of the start-up at most, about
 _STARTUP_CELLS = 400  # of a material point in the animation, whose P80 then scatters by some per cent
 _EXCHANGE_GRID = {"points": 200, "cells": 2000}  # at most, of the one assumption that needs the whole lattice
 _SIEVES = tuple(float(f"{10 ** (k / 20 - 6):.6g}") for k in range(121))  # 1 um to 1 m, twice as fine as the default
@@ -31,48 +43,44 @@ _SIEVES = tuple(float(f"{10 ** (k / 20 - 6):.6g}") for k in range(121))  # 1 um 
 
 @dataclass(frozen=True)
 class Options:
-    """Options of the figures."""
+    """Options of the figures; without level, cells, points and streamlines level fine, with exchange standard."""
 
-    scene: Annotated[str, shown_as("PRESET|FILE")] = "paper"
-    """Scene: a preset (paper, khd_pilot), or the path of a .toml or .json scene file."""
-    level: Annotated[Literal["draft", "standard", "fine"] | None, shown_as("draft|standard|fine")] = None
-    """Named resolution of figures 3a, 3b, 4 and 5 (default: fine; with exchange standard)."""
-    cells: Annotated[int | None, shown_as("N")] = None
-    """Cells per material point, instead of a level; what is not given is then the scene's."""
-    points: Annotated[int | None, shown_as("N")] = None
-    """Material points per streamline, instead of a level."""
-    streamlines: Annotated[int | None, shown_as("N")] = None
-    """Streamlines from the mid-plane to the roll, instead of a level."""
+    scene: SceneName = "paper"
+    level: Level = None
+    cells: Cells = None
+    points: Points = None
+    streamlines: Streamlines = None
     shown_points: Annotated[int, shown_as("N")] = 80
     """Material points per streamline in figures 3c and 3d and in the animation: few enough to be seen."""
-    exchange: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Switch on segregation and mixing between streamlines, as the scene says, or else with default strength."""
+    exchange: Exchange = False
     assumptions: bool = True
     """Run the scene with other assumptions too, and say what they change, or not."""
     animation: bool = True
     """Draw the animation of the start-up, or not."""
-    seed: Annotated[int, shown_as("N")] = 0
-    """Seed of all randomness; the same seed gives the same bits."""
+    seed: Seed = 0
     out: Annotated[Path, shown_as("FOLDER")] = Path("outputs")
     """Folder for paper.nc, paper_figure3.png, paper_figure4.png, paper_figure5.png and paper_startup.gif."""
+    overwrite: Overwrite = False
 
 
-@refusing
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw the figures and return the exit code, 0 or 2; `arguments` default to the command line's."""
-    options = tyro.cli(Options, prog="python -m studies.paper", description=__doc__, args=arguments)
-    scene = _scene(options)
-    refuse_key("--seed", options.seed)
-    from studies import store
+def _files(options: Options) -> list[Path]:
+    return [options.out / name for name in ("paper.nc", *FIGURES, *([ANIMATION] if options.animation else []))]
 
-    store.probe(options.out / "paper.nc")
+
+@command("paper", __doc__, files=_files)
+def main(options: Options) -> Report:
+    """Draw the figures of the command line."""
+    scene = base_scene(options)
+    if all(value is None for value in (options.level, options.cells, options.points, options.streamlines)):
+        scene = scene.with_values({"resolution": "fine" if scene.exchange is None else "standard"})
     result = study(scene, options.shown_points, options.seed, options.animation, options.assumptions)
-    given = sys.argv[1:] if arguments is None else arguments
-    result.attrs["history"] = f"python -m studies.paper {shlex.join(given)}".strip()
-    written = _write(result, options)
-    print("\n".join(findings(result)))
-    print("wrote " + ", ".join(map(str, written)))
-    return 0
+    from studies.show.plots import paper as plots
+
+    figures = [
+        figure(lambda draw=draw: draw(result), dpi=110) for draw in (plots.figure3, plots.figure4, plots.figure5)
+    ]
+    animation = lambda path, history: plots.startup_animation(result, path, history)  # noqa: E731
+    return Report(findings(result), [result, *figures, animation])
 
 
 def study(
@@ -83,7 +91,7 @@ def study(
     Parameters
     ----------
     scene : Scene
-        What is simulated, at its own resolution.
+        What is simulated, at its own resolution and, if it has a pressing force, at the gap that carries it.
     shown_points : int
         Material points per streamline where single ones are drawn: figures 3c, 3d and the start-up.
     seed : int
@@ -96,7 +104,7 @@ def study(
     xarray.Dataset
         Fields over (streamline, point), the left roll to the right one, mid-plane and outermost streamlines
         included; shown points and their volumes; products over (product_streamline, sieve), the mid-plane to the
-        roll; `startup_p80` over photographs; pressures and P80 by assumption.
+        roll; `startup_p80` over snapshots; pressures and P80 by assumption.
 
     Raises
     ------
@@ -112,30 +120,69 @@ def study(
     >>> dict(result["pressure"].sizes)
     {'streamline': 9, 'point': 50}
     """
-    import xarray as xr
+    from hpgr import run
+    from hpgr.results import schema
 
     _refuse(scene, shown_points)
+    floated = run.load(scene)[0]
+    # everything is drawn at this gap, also what has another number of points, or another law
+    scene = floated.with_values({"rolls.specific_pressing_force": None})
     shown = scene.with_values({"resolution.points": shown_points})
-    result = xr.Dataset()
-    _add_rolls(result, scene)
-    _add_fields(result, scene)
-    _add_shown(result, shown)
-    _add_product(result, scene, seed)
-    if animation:
-        _add_startup(result, shown, seed)
-    if assumptions:
-        _add_assumptions(result, scene, seed)
-    return result.assign_attrs(_attributes(scene, shown_points, seed) | result.attrs)
+    values, told = _product(scene, seed)
+    values |= _rolls(scene) | _fields(scene) | _shown(shown)
+    values |= _startup(shown, seed) if animation else {}
+    values |= _assumptions(scene, seed) if assumptions else {}
+    attrs = schema.dataset_attributes(
+        "Figures 3, 4 and 5 of 'Heterarchical model of comminution in high pressure grinding rolls'",
+        history=f"studies.paper.study(scene, {shown_points}, seed={seed})",
+        scene=floated.model_dump_json(),
+        shown_points=shown_points,
+        seed=seed,
+        streamline_deviation_m=run.load(scene)[1].geometry.deviation(),
+    )
+    return schema.to_dataset(values, attrs | told, _own())
 
 
-def _scene(options: Options) -> Scene:
-    names = ("level", "cells", "points", "streamlines")
-    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    scene = base_scene(options.scene)
-    if options.exchange and scene.exchange is None:
-        scene = scene.with_values({"exchange": {}})
-    given = given or {"level": "fine" if scene.exchange is None else "standard"}
-    return scene.with_values({f"resolution.{name}": value for name, value in given.items()})
+def _own() -> dict[str, Any]:
+    """Return the table of the study's own variables."""
+    from functools import partial
+
+    from hpgr.results.schema import Variable
+
+    field, place, corner = ("streamline", "point"), ("shown_streamline", "shown_point"), ("corner",)
+    product, frame, variant = ("product_streamline",), ("snapshot",), ("variant",)
+    whole = partial(Variable, dtype=None)
+    across = "across the gap, negative on the left"
+    table = {
+        "roll_radius": whole((), "m", "radius of the rolls"),
+        "roll_axis_x": whole((), "m", "distance of the roll axes from the mid-plane", "at height 0"),
+        "xi": whole(("streamline",), "1", "position of the streamline", "over half the gap, negative on the left"),
+        "x": whole(field, "m", "distance from the mid-plane", across),
+        "mid_gap_depth": whole(("point",), "m", "depth on the mid-plane", "below the top of the bed, where v = 0"),
+        "mid_gap_pressure": whole(("point",), "Pa", "mean stress on the mid-plane"),
+        "shown_x": whole(place, "m", "distance of the shown point from the mid-plane", across),
+        "shown_height": whole(place, "m", "height of the shown point", "above the minimum gap"),
+        "volume": whole(place, "m2", "volume per roll width", "area of the shown point's Voronoi cell"),
+        "shown_time_step": whole((), "s", "time between neighbouring shown points"),
+        "outline_cell": whole(("outline",), "1", "number of the right half's shown point", "that the outline is of"),
+        "corner_outline": whole(corner, "1", "number of the outline", "that the corner is of"),
+        "corner_x": whole(corner, "m", "distance of the corner from the mid-plane", "of a Voronoi cell, right half"),
+        "corner_height": whole(corner, "m", "height of the corner", "of a Voronoi cell above the minimum gap"),
+        "product_xi": whole(product, "1", "position of the stream tube", "distance from the mid-plane over half gap"),
+        "passing": Variable((*product, "sieve"), "1", "mass fraction passing", "product of the stream tube"),
+        "p50": Variable(product, "m", "product P50", "size that 50 % of the stream tube's product passes"),
+        "p80": Variable(product, "m", "product P80", "size that 80 % of the stream tube's product passes"),
+        "feed_passing": whole(("sieve",), "1", "mass fraction of the feed passing"),
+        "snapshot": whole(frame, "1", "snapshot number", "of the start-up"),
+        "elapsed_time": whole(frame, "s", "time since the machine was filled"),
+        "steady": whole(frame, "1", "whether the snapshot is steady", "taken after one residence time"),
+        "startup_p80": whole((*frame, *place), "m", "P80 at the shown point", "while the machine fills"),
+        "assumption": whole(variant, "", "what is changed in the scene"),
+    }
+    for where, tube in {"mid_gap": "innermost", "roll": "outermost"}.items():
+        table[f"assumed_peak_pressure_{where}"] = whole(variant, "Pa", f"peak pressure of the {tube} stream tube")
+        table[f"assumed_p80_{where}"] = whole(variant, "m", f"product P80 of the {tube} stream tube")
+    return table
 
 
 def _refuse(scene: Scene, shown_points: int) -> None:
@@ -161,65 +208,46 @@ def mirrored(values, odd: bool = False) -> np.ndarray:
 
 def _across(values, odd: bool = False) -> np.ndarray:
     """Return both halves of values whose first streamline is the mid-plane."""
-    values = np.asarray(values)
-    return np.concatenate([mirrored(values, odd)[: len(values) - 1], values])
+    return np.delete(mirrored(values, odd), len(values) - 1, axis=0)
 
 
-def _add_rolls(result, scene: Scene) -> None:
-    result["roll_radius"] = ((), scene.rolls.diameter / 2, {"units": "m", "long_name": "radius of the rolls"})
-    attrs = {"units": "m", "long_name": "distance of the roll axes from the mid-plane, at height 0"}
-    result["roll_axis_x"] = ((), (scene.rolls.gap + scene.rolls.diameter) / 2, attrs)
+def _rolls(scene: Scene) -> dict[str, Any]:
+    rolls = scene.rolls
+    return {"roll_radius": rolls.diameter / 2, "roll_axis_x": (rolls.gap + rolls.diameter) / 2}
 
 
-def _add_fields(result, scene: Scene) -> None:
-    """Add figures 3a, 3b and 4: everything that needs no grains, on the stream tubes' centres, mid-plane and rim."""
-    from hpgr import flow, geometry, schema, stress
+def _fields(scene: Scene) -> dict[str, Any]:
+    """Return figures 3a, 3b and 4: everything that needs no grains, on the stream tubes' centres, mid-plane and rim."""
+    from hpgr.bed import geometry, kinematics, stress
 
-    bed = geometry.bed(scene.rolls, scene.resolution.streamlines)
-    bed = bed._replace(xi=np.array([0.0, *bed.xi, 1.0]))
-    grid, substeps = scene.resolution, scene.stress.substeps
-    motion = flow.move(scene, bed, (grid.points - 1) * substeps + 1)
-    state = stress.load(scene, motion)
-    place = {"xi": bed.xi, "x": motion.x, "height": motion.y}
-    for name, values in place.items():
-        values = _across(values, odd=name != "height")
-        dims = schema.COORDINATES[name].dims
-        values = values if name == "xi" else values[:, ::substeps]
-        result.coords[name] = (dims, values, schema.attributes(name))
-    result["x"].attrs["long_name"] = "distance from the mid-plane, across the gap, negative on the left"
-    result["xi"].attrs["long_name"] += ", negative on the left"
-    fields = {
+    rolls, packing, substeps = scene.rolls, scene.bed, scene.elasticity.substeps
+    xi = np.array([0.0, *geometry.centres(scene.resolution.streamlines), 1.0])
+    bed = geometry.between_rolls(rolls.diameter, rolls.gap, rolls.entry_gap, xi)
+    flow = scene.flow.constants(rolls.gap, rolls.diameter, packing.feed_solid_fraction)
+    fine = (scene.resolution.points - 1) * substeps + 1
+    motion, strains = kinematics.move(bed, flow, rolls.surface_speed, fine)
+    solid = packing.feed_solid_fraction, packing.max_solid_fraction
+    state = stress.load(scene.elasticity.constants(), *solid, motion, strains)
+    found = {
+        "x": motion.x,
+        "height": motion.y,
         "speed": motion.speed,
         "volumetric_strain_rate": motion.volumetric_rate,
         "pressure": state.pressure,
         "shear_stress": state.shear_stress,
     }
-    for name, values in fields.items():
-        result[name] = (("streamline", "point"), _across(values)[:, ::substeps], schema.attributes(name))
-    middle = len(bed.xi) - 1
-    attrs = {"units": "m", "long_name": "depth on the mid-plane below the top of the bed, where the speed is zero"}
-    result["mid_gap_depth"] = ("point", bed.height - result["height"].values[middle], attrs)
-    attrs = {"units": "Pa", "long_name": "mean stress on the mid-plane"}
-    result["mid_gap_pressure"] = ("point", result["pressure"].values[middle], attrs)
-    result.attrs["streamline_deviation_m"] = bed.deviation()
+    values = {name: _across(each[:, ::substeps], odd=name == "x") for name, each in found.items()}
+    middle = len(xi) - 1
+    values |= {"mid_gap_depth": bed.height - values["height"][middle], "mid_gap_pressure": values["pressure"][middle]}
+    return values | {"xi": _across(xi, odd=True)}
 
 
-def _add_shown(result, shown: Scene) -> None:
-    """Add figures 3c and 3d: few material points, their volumes, and the outlines of the right half's."""
-    from hpgr import flow, geometry, tessellation
+def _shown(shown: Scene) -> dict[str, Any]:
+    """Return figures 3c and 3d: few material points, their volumes, and the outlines of the right half's."""
+    from hpgr.bed.loaded import inputs_of, load_bed
 
-    bed = geometry.bed(shown.rolls, shown.resolution.streamlines)
-    motion = flow.move(shown, bed, shown.resolution.points)
-    cells = tessellation.tessellate(shown, bed, motion)
-    dims = ("shown_streamline", "shown_point")
-    attrs = {"units": "m", "long_name": "distance of the shown point from the mid-plane, negative on the left"}
-    result.coords["shown_x"] = (dims, mirrored(motion.x, odd=True), attrs)
-    attrs = {"units": "m", "long_name": "height of the shown point above the minimum gap"}
-    result.coords["shown_height"] = (dims, mirrored(motion.y), attrs)
-    attrs = {"units": "m2", "long_name": "area of the Voronoi cell of the shown point, volume per roll width"}
-    result["volume"] = (dims, mirrored(cells.volume), attrs)
-    attrs = {"units": "s", "long_name": "time between neighbouring shown points of a streamline"}
-    result["shown_time_step"] = ((), motion.time_step, attrs)
+    bed = load_bed(inputs_of(shown, tessellated=True))
+    motion, cells = bed.kinematics, bed.tessellation
     # the concave rim may cut a cell in two: outlines are of pieces
     pieces = [
         (number, np.asarray(piece.exterior.coords))
@@ -227,122 +255,95 @@ def _add_shown(result, shown: Scene) -> None:
         for piece in getattr(cell, "geoms", [cell])
     ]
     corners = np.concatenate([outline for _, outline in pieces])
-    sizes = [len(outline) for _, outline in pieces]
-    attrs = {"units": "1", "long_name": "number of the right half's shown point that the outline is of"}
-    result["outline_cell"] = ("outline", np.array([number for number, _ in pieces], np.int32), attrs)
-    attrs = {"units": "1", "long_name": "number of the outline that the corner is of"}
-    result["corner_outline"] = ("corner", np.repeat(np.arange(len(pieces), dtype=np.int32), sizes), attrs)
-    attrs = {"units": "m", "long_name": "distance of the corner of a Voronoi cell from the mid-plane, right half"}
-    result["corner_x"] = ("corner", corners[:, 0], attrs)
-    attrs = {"units": "m", "long_name": "height of the corner of a Voronoi cell above the minimum gap"}
-    result["corner_height"] = ("corner", corners[:, 1], attrs)
+    numbers = np.arange(len(pieces), dtype=np.int32)
+    return {
+        "shown_x": mirrored(motion.x, odd=True),
+        "shown_height": mirrored(motion.y),
+        "volume": mirrored(cells.volume),
+        "shown_time_step": motion.time_step,
+        "outline_cell": np.array([number for number, _ in pieces], np.int32),
+        "corner_outline": np.repeat(numbers, [len(outline) for _, outline in pieces]),
+        "corner_x": corners[:, 0],
+        "corner_height": corners[:, 1],
+    }
 
 
-def _add_product(result, scene: Scene, seed: int) -> None:
-    """Add figure 5: the product of every stream tube from the mid-plane to the roll, and the feed."""
-    import hpgr
-    from hpgr import feed
+def _product(scene: Scene, seed: int) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return figure 5, the product of every stream tube from mid-plane to roll and the feed, and what is told of it."""
+    from hpgr import run
 
-    product = hpgr.simulate(scene.with_values({"resolution.record": "product", "resolution.sieves": _SIEVES}), seed)
-    attrs = dict(
-        product["xi"].attrs, long_name="position of the stream tube: distance from the mid-plane over half gap"
-    )
-    result.coords["product_xi"] = ("product_streamline", product["xi"].values, attrs)
-    result.coords["sieve"] = product["sieve"]
-    for name in ("passing", "p50", "p80"):
-        result[name] = product[name].drop_vars("xi").rename(streamline="product_streamline")
-    attrs = {"units": "1", "long_name": "mass fraction of the feed passing"}
-    result["feed_passing"] = ("sieve", feed.passing(scene.feed, np.array(_SIEVES)), attrs)
-    result.attrs |= {name: product.attrs[name] for name in ("notes", "solver")}
+    found = run.run_scene(scene.with_values({"resolution.record": "product", "resolution.sieves": _SIEVES}), seed)
+    values = {name: found.values[name] for name in ("passing", "p50", "p80", "sieve")}
+    values |= {"product_xi": found.values["xi"], "feed_passing": scene.feed.passing(_SIEVES)}
+    return values, {"diagnostics": found.diagnostics, "solver": found.solver}
 
 
-def _add_startup(result, shown: Scene, seed: int) -> None:
-    """Add P80 of the shown points while the machine, filled with feed, turns until it is steady."""
-    import hpgr
+def _startup(shown: Scene, seed: int) -> dict[str, Any]:
+    """Return P80 of the shown points while the machine, filled with feed, turns until it is steady."""
+    from hpgr import run
 
-    points = shown.resolution.points
-    values = {
+    changed = {
         "resolution.cells": min(shown.resolution.cells, _STARTUP_CELLS),
         "resolution.record": "cells",
-        "resolution.photographs": 1,
+        "resolution.snapshots": 1,
         "exchange.record_startup": True,
-        "exchange.fill": "feed",
-        "exchange.interval": max(1, round((points - 1) / _FRAMES)),
+        "exchange.start": "feed",
+        "exchange.interval": max(1, round((shown.resolution.points - 1) / _FRAMES)),
     }
     if shown.exchange is None:  # the lattice without swaps gives the product that a scene without exchange has
-        values |= {"exchange.segregation": 0.0, "exchange.mixing": 0.0}
-    machine = hpgr.simulate(shown.with_values(values), seed)
-    p80 = np.quantile(machine["size"].values, 0.8, axis=-1)
-    attrs = {"units": "1", "long_name": "number of the photograph"}
-    result.coords["photograph"] = ("photograph", machine["time"].values, attrs)
-    result.coords["elapsed_time"] = ("photograph", machine["elapsed_time"].values, machine["elapsed_time"].attrs)
-    result.coords["steady"] = ("photograph", machine["steady"].values, machine["steady"].attrs)
-    attrs = {"units": "m", "long_name": "size that 80 % of the mass at the shown point passes"}
-    both = np.stack([mirrored(frame) for frame in p80])
-    result["startup_p80"] = (("photograph", "shown_streamline", "shown_point"), both, attrs)
+        changed |= {"exchange.segregation": 0.0, "exchange.mixing": 0.0}
+    machine = run.run_scene(shown.with_values(changed), seed).values
+    p80 = np.quantile(machine["size"], 0.8, axis=-1)
+    values = {name: machine[name] for name in ("elapsed_time", "steady")}
+    return values | {"snapshot": machine["time"], "startup_p80": np.stack([mirrored(frame) for frame in p80])}
 
 
 def variants(scene: Scene) -> dict[str, Scene]:
-    """Return the scene without exchange, and with one assumption changed at a time, by what is changed."""
-    ore, base = scene.material, scene.with_values({"exchange": None, "resolution.record": "product"})
+    """Return the scene without exchange, and with one assumption changed at a time, by what is changed.
+
+    What the scene's laws have no field of is left out.
+    """
     changed = {
-        "as it is, without exchange": {},
-        "c = 1": {"material.elastic_exponent": 1.0},
-        "phi held at the feed's": {"material.max_solid_fraction": ore.feed_solid_fraction},
-        "phi up to 1": {"material.max_solid_fraction": 1.0},
-        "n = 0.5": {"material.cushioning": 0.5},
-        "n = inf": {"material.cushioning": "inf"},
-        "gamma = 0.35": {"material.fragment_exponent": 0.35},
-        "crushed by p + 2q/3": {"stress.crushing": "major"},
-        "Euler integration": {"stress.integrator": "euler"},
+        "c = 1": {"elasticity.exponent": 1.0},
+        "phi held at the feed's": {"bed.max_solid_fraction": scene.bed.feed_solid_fraction},
+        "phi up to 1": {"bed.max_solid_fraction": 1.0},
+        "n = 0.5": {"strength.cushioning": 0.5},
+        "n = inf": {"strength.cushioning": "inf"},
+        "gamma = 0.35": {"fragments.exponent": 0.35},
+        "crushed by p + 2q/3": {"strength.stress": "major"},
+        "Euler integration": {"elasticity.integrator": "euler"},
         "speed exponent m = 0.5": {"flow.exponent": 0.5},
         "speed exponent m = 2": {"flow.exponent": 2.0},
         "first point at 0.1 H": {"flow.entry_fraction": 0.1},
     }
-    scenes = {name: base.with_values(values) for name, values in changed.items()}
+    base = scene.with_values({"exchange": None, "resolution.record": "product"})
+    known = values_of(base)
+    scenes = {name: base.with_values(values) for name, values in changed.items() if values.keys() <= known.keys()}
     strength = scene.exchange or scene.with_values({"exchange": {}}).exchange
     grid = {f"resolution.{name}": min(getattr(base.resolution, name), most) for name, most in _EXCHANGE_GRID.items()}
     name = f"exchange A = {strength.segregation:g}, B = {strength.mixing:g}"
-    scenes[name] = base.with_values({"exchange": strength} | grid)
-    first = next(iter(scenes))
-    return {name: other for name, other in scenes.items() if name == first or other != base}
+    scenes[name] = base.with_values({"exchange": strength, "roll_width": None} | grid)
+    return {"as it is, without exchange": base} | {name: other for name, other in scenes.items() if other != base}
 
 
-def _add_assumptions(result, scene: Scene, seed: int) -> None:
-    """Add peak pressure and P80 at mid-gap and at the roll, with one assumption changed at a time."""
-    import hpgr
+def _assumptions(scene: Scene, seed: int) -> dict[str, Any]:
+    """Return peak pressure and P80 at mid-gap and at the roll, with one assumption changed at a time."""
+    from hpgr import run
 
     scenes = variants(scene)
-    runs = [hpgr.simulate(other, seed) for other in scenes.values()]
-    result.coords["assumption"] = ("variant", list(scenes), {"long_name": "what is changed in the scene"})
-    words = {"streamline_peak_pressure": "largest mean stress on", "p80": "product P80 of"}
-    for name, what in words.items():
-        for place, number in {"mid_gap": 0, "roll": -1}.items():
-            short = {"streamline_peak_pressure": "peak_pressure"}.get(name, name)
-            tube = "innermost" if number == 0 else "outermost"
-            attrs = {"units": runs[0][name].attrs["units"], "long_name": f"{what} the {tube} stream tube"}
-            result[f"assumed_{short}_{place}"] = ("variant", [float(run[name][number]) for run in runs], attrs)
-
-
-def _attributes(scene: Scene, shown_points: int, seed: int) -> dict[str, Any]:
-    import hpgr
-
-    return {
-        "Conventions": "CF-1.11",
-        "title": "Figures 3, 4 and 5 of 'Heterarchical model of comminution in high pressure grinding rolls'",
-        "source": f"hpgr {hpgr.__version__}",
-        "history": f"hpgr {hpgr.__version__}: studies.paper.study(scene, {shown_points}, seed={seed})",
-        "scene": scene.model_dump_json(),
-        "shown_points": shown_points,
-        "seed": seed,
-    }
+    runs = [run.run_scene(other, seed).values for other in scenes.values()]
+    found: dict[str, Any] = {"assumption": list(scenes)}
+    for short, name in {"peak_pressure": "streamline_peak_pressure", "p80": "p80"}.items():
+        for where, number in {"mid_gap": 0, "roll": -1}.items():
+            found[f"assumed_{short}_{where}"] = [float(np.float32(each[name][number])) for each in runs]
+    return found
 
 
 def findings(result: "xr.Dataset") -> list[str]:
     """Return lines that put numbers beside what the paper says of its figures in words."""
     lines = [_pressure_words(result), _across_words(result), _product_words(result)]
     if "assumption" in result:
-        lines += ["", *_assumption_lines(result), ""]
+        lines += ["", *_assumption_table(result).splitlines(), ""]
     return lines
 
 
@@ -391,38 +392,18 @@ def _product_words(result) -> str:
     )
 
 
-def _assumption_lines(result) -> list[str]:
-    names = ("assumed_peak_pressure_mid_gap", "assumed_peak_pressure_roll", "assumed_p80_mid_gap", "assumed_p80_roll")
-    columns = [result[name].values.astype(float) for name in names]
-    width = max(map(len, result["assumption"].values))
-    lines = [f"{'assumption':<{width}}  peak pressure [MPa]: mid-gap, roll, ratio      P80 [mm]: mid-gap, roll, ratio"]
-    for name, p_mid, p_roll, s_mid, s_roll in zip(result["assumption"].values, *columns, strict=True):
-        p_ratio = f"{p_roll / p_mid:.3f}" if p_mid > 0 else "-"
-        lines.append(
-            f"{name:<{width}}  {1e-6 * p_mid:18.2f} {1e-6 * p_roll:10.2f} {p_ratio:>8}  "
-            f"{1e3 * s_mid:24.4g} {1e3 * s_roll:8.4g} {s_roll / s_mid:8.3f}"
+def _assumption_table(result) -> str:
+    from studies.show.report import aligned
+
+    columns = []
+    for name, factor, form in (("peak_pressure", 1e-6, ".2f"), ("p80", 1e3, ".4g")):
+        inner, outer = (
+            factor * result[f"assumed_{name}_{where}"].values.astype(float) for where in ("mid_gap", "roll")
         )
-    return lines
-
-
-def _write(result: "xr.Dataset", options: Options) -> list[Path]:
-    """Write the NetCDF file, the figures and the animation; return their paths."""
-    from studies import store
-    from studies.plots import paper as plots
-
-    folder = options.out
-    drawn = dict(zip(FIGURES, (plots.figure3, plots.figure4, plots.figure5), strict=True))
-    try:
-        store.write_dataset(result, folder / "paper.nc")
-        for name, draw in drawn.items():
-            figure = draw(result)
-            store.replace(folder / name, lambda part, figure=figure: figure.savefig(part, dpi=110))
-        if options.animation:
-            store.replace(folder / ANIMATION, lambda part: plots.startup_animation(result, part))
-    except OSError as error:
-        raise OSError(f"could not write the result: {error}") from error
-    names = ["paper.nc", *FIGURES, *([ANIMATION] if options.animation else [])]
-    return [folder / name for name in names]
+        ratios = [f"{roll / middle:.3f}" if middle > 0 else "-" for middle, roll in zip(inner, outer, strict=True)]
+        columns += [[format(one, form) for one in each] for each in (inner, outer)] + [ratios]
+    headings = ["assumption", "peak pressure [MPa]: mid-gap", "roll", "ratio", "P80 [mm]: mid-gap", "roll", "ratio"]
+    return aligned(headings, zip(result["assumption"].values, *columns, strict=True), words=1)
 
 
 if __name__ == "__main__":

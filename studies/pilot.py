@@ -9,11 +9,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
-import tyro
-
 from hpgr import presets
-from hpgr.scene import Material, Scene
-from studies.command import base_scene, refusing, shown_as
+from hpgr.fields import values_of
+from hpgr.scene import Scene
+from studies.command import (
+    Out,
+    Overwrite,
+    Plot,
+    Report,
+    SceneName,
+    base_scene,
+    command,
+    figure,
+    shown_as,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -24,6 +33,14 @@ _FIT = ("sigma_m", "w", "gamma", "n", "K", "alpha", "kappa", "T_0")
 _FIRST = ("K-P1", "K-P3")  # one test does not fix how fineness answers to force
 _EDGE_SHARE = 0.2  # where it was not measured
 _SLICES = 4
+_QUARTZ = (  # what is fitted starts from the paper's
+    "strength.reference_strength",
+    "strength.weibull_modulus",
+    "strength.cushioning",
+    "fragments.exponent",
+    "elasticity.bulk_modulus",
+    "elasticity.shear_modulus",
+)
 
 
 @dataclass(frozen=True)
@@ -38,8 +55,7 @@ class Options:
     """Tests to fit to (default: K-P1 and K-P3); all others are predicted blind."""
     fit: Annotated[tuple[str, ...], shown_as("SYMBOL ...")] = _FIT
     """Parameters to fit: sigma_m, w, gamma, n, K, alpha, kappa, T_0; those that the tests cannot tell are left out."""
-    scene: Annotated[str, shown_as("PRESET|FILE")] = "khd_pilot"
-    """Machine and bed: a preset or a scene file. Of a preset, strength and elasticity start from the paper's quartz."""
+    scene: SceneName = "khd_pilot"
     streamlines: Annotated[int, shown_as("N")] = 3
     """Streamlines from the mid-plane to the roll."""
     points: Annotated[int, shown_as("N")] = 100
@@ -48,10 +64,9 @@ class Options:
     """Cells per material point; 0 is refused."""
     baselines: bool = True
     """Fit Torres & Casali and Hinde & Kalala to the same tests, or not."""
-    out: Annotated[Path, shown_as("FILE")] = Path("outputs/pilot.nc")
-    """NetCDF file to write; the figure goes beside it as .png."""
-    plot: bool = True
-    """Draw the figure, or not."""
+    out: Out = Path("outputs/pilot.nc")
+    plot: Plot = True
+    overwrite: Overwrite = False
 
 
 class Model(NamedTuple):
@@ -62,16 +77,13 @@ class Model(NamedTuple):
     words: str
 
 
-@refusing
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the study and return the exit code; `arguments` default to the command line's."""
-    options = tyro.cli(Options, prog="python -m studies.pilot", description=__doc__, args=arguments)
+@command("pilot", __doc__)
+def main(options: Options) -> Report:
+    """Run the study of the command line; of a preset strength and elasticity start from the paper's quartz."""
+    from hpgr.tables import read_pilot_tests
+
     if options.cells < 1:
         raise ValueError(f"--cells: got {options.cells}; must be at least 1; such as --cells 2000")
-    from hpgr.tables import read_pilot_tests
-    from studies import store
-
-    store.probe(options.out)
     try:
         tests = read_pilot_tests(options.tests, options.operations)
     except OSError as error:
@@ -81,20 +93,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     known = _chosen(options.calibrate_on, tests)
     scene, fit = starting_scene(options, known)
     models = _models(scene, known, fit, options.baselines)
-    result = assemble(tests, [test.name for test in known], models)
-    result.attrs["scene"] = scene.model_dump_json()
-    print("\n".join(words(result, models)))
-    store.write_dataset(result, options.out)
-    written = [str(options.out)]
-    if options.plot:
-        from studies.plots import pilot as plots
+    result = assemble(tests, [test.name for test in known], models, scene)
+    from studies.show.plots.pilot import pilot_figure
 
-        picture = options.out.with_suffix(".png")
-        figure = plots.pilot_figure(result)
-        store.replace(picture, lambda part: figure.savefig(part, dpi=130))
-        written.append(str(picture))
-    print("wrote " + " and ".join(written))
-    return 0
+    return Report(words(result, models), [result, figure(lambda: pilot_figure(result), dpi=130)])
 
 
 def _chosen(names: Sequence[str] | None, tests: Sequence[Any]) -> list[Any]:
@@ -114,19 +116,18 @@ def starting_scene(options: Options, known: Sequence[Any]) -> tuple[Scene, list[
 
     The edge share is that which the measured distributions mix to their totals with.
     """
-    scene = base_scene(options.scene, streamlines=options.streamlines, points=options.points, cells=options.cells)
+    scene = base_scene(options)
     values: dict[str, Any] = {"resolution.record": "product"}
-    if options.scene in presets.PRESETS:
-        quartz = Material()
-        names = ("strength", "weibull_modulus", "cushioning", "fragment_exponent", "bulk_modulus", "shear_modulus")
-        values |= {f"material.{name}": getattr(quartz, name) for name in names} | {"rolls.idle_torque": 0.0}
+    if options.scene in presets.NAMES:
+        quartz = values_of(presets.paper())
+        values |= {name: quartz[name] for name in _QUARTZ} | {"rolls.idle_torque": 0.0}
     apart = [test for test in known if _measured(test.centre) and _measured(test.edge)]
     fit = list(options.fit)
     if apart and scene.roll_width is None:
         values["roll_width"] = {"edge_share": edge_share(apart), "slices": _SLICES}
     unknown = {
         "kappa": not apart,
-        "alpha": scene.flow.profile != "nip",
+        "alpha": scene.flow.kind != "nip",
         "T_0": all(math.isnan(test.power) for test in known),
     }
     return scene.with_values(values), [name for name in fit if not unknown.get(name)]
@@ -175,12 +176,12 @@ def _baselines(scene: Scene, known: Sequence[Any]) -> list[Model]:
     models = []
     force = "specific_pressing_force" if any(math.isnan(t.hydraulic_pressure) for t in known) else "hydraulic_pressure"
     opening = "gap" if any(math.isnan(t.cake_thickness) for t in known) else "cake_thickness"
-    rolls, ore = scene.rolls, scene.material
+    rolls, bed = scene.rolls, scene.bed
     densities = [t.throughput / (getattr(t, opening) * rolls.width * t.surface_speed) for t in known]
     densities = [density for density in densities if math.isfinite(density)]
-    cake = sum(densities) / len(densities) if densities else 0.85 * ore.solid_density
+    cake = sum(densities) / len(densities) if densities else 0.85 * bed.solid_density
     machine = baselines.Machine(
-        rolls.diameter, rolls.width, ore.solid_density, ore.solid_density * ore.feed_solid_fraction, cake
+        rolls.diameter, rolls.width, bed.solid_density, bed.solid_density * bed.feed_solid_fraction, cake
     )
     for name, fit in (
         ("Torres & Casali", lambda: baselines.fit_torres_casali(known, machine, opening=opening, force=force)),
@@ -195,67 +196,68 @@ def _baselines(scene: Scene, known: Sequence[Any]) -> list[Model]:
     return models
 
 
-def assemble(tests: Sequence[Any], known: Sequence[str], models: Sequence[Model]) -> "xr.Dataset":
+def assemble(tests: Sequence[Any], known: Sequence[str], models: Sequence[Model], scene: Scene) -> "xr.Dataset":
     """Return measured and predicted figures of every test as one Dataset; NaN is not measured, or not predicted."""
     import numpy as np
-    import xarray as xr
 
-    sizes = np.unique(np.concatenate([test.sizes for test in tests]))
-    passing = np.full((1 + len(models), len(tests), len(PARTS), sizes.size), np.nan, np.float32)
-    figures = {name: np.full((1 + len(models), len(tests)), np.nan) for name in (*FIGURES, "gap")}
-    failures = np.full((1 + len(models), len(tests)), "", object)
+    from hpgr.results import schema
+
+    sizes, shape = np.unique(np.concatenate([test.sizes for test in tests])), (1 + len(models), len(tests))
+    passing = np.full((*shape, len(PARTS), sizes.size), np.nan)
+    figures = {name: np.full(shape, np.nan) for name in (*FIGURES, "gap")}
+    failures = np.full(shape, "", object)
     for t, test in enumerate(tests):
         at = np.searchsorted(sizes, test.sizes)
-        rows = [test, *(_predicted(model, test) for model in models)]
-        for m, row in enumerate(rows):
-            if isinstance(row, str):
-                failures[m, t] = row
-                continue
+        measured = test._asdict() | {"gap": test.cake_thickness}
+        for m, row in enumerate([measured, *(_predicted(model, test) for model in models)]):
+            failures[m, t] = row.get("failure", "")
             for p, part in enumerate(PARTS):
-                values = getattr(row, part)
-                if values is not None:
-                    passing[m, t, p, at] = values
-            for name in FIGURES:
-                figures[name][m, t] = getattr(row, name)
-            figures["gap"][m, t] = test.cake_thickness if m == 0 else getattr(row, "gap", np.nan)
+                if row.get(part) is not None:
+                    passing[m, t, p, at] = row[part]
+            for name, values in figures.items():
+                values[m, t] = row.get(name, np.nan)
     energy = figures["specific_energy"]
     energy[0] = np.where(np.isnan(energy[0]), figures["power"][0] / figures["throughput"][0], energy[0])
-    dims = ("source", "test")
-    result = xr.Dataset(
-        {
-            "passing": ((*dims, "part", "sieve"), passing, {"units": "1", "long_name": "mass fraction passing"}),
-            **{name: (dims, values, _ATTRIBUTES[name]) for name, values in figures.items()},
-            "blind": ("test", np.array([test.name not in known for test in tests], np.int8),
-                      {"units": "1", "long_name": "whether the test was left out of the fit"}),
-            "failure": (dims, failures, {"long_name": "why a model predicts nothing of a test"}),
-        },
-        {
-            "source": ("source", np.array(["measured", *(model.name for model in models)], object),
-                       {"long_name": "measurement or model"}),
-            "test": ("test", np.array([test.name for test in tests], object), {"long_name": "pilot test"}),
-            "part": ("part", np.array(PARTS, object), {"long_name": "part of the roll width"}),
-            "sieve": ("sieve", sizes, {"units": "m", "long_name": "sieve size"}),
-        },
-        {"Conventions": "CF-1.11", "title": "Pilot tests, measured and predicted",
-         "models": "\n".join(f"{model.name}: {model.words}" for model in models)},
-    )  # fmt: skip
+    values = figures | {
+        "passing": passing,
+        "blind": [test.name not in known for test in tests],
+        "failure": failures,
+        "source": np.array(["measured", *(model.name for model in models)], object),
+        "test": np.array([test.name for test in tests], object),
+        "part": np.array(PARTS, object),
+        "sieve": sizes,
+    }
+    told = "\n".join(f"{model.name}: {model.words}" for model in models)
+    attrs = schema.dataset_attributes("Pilot tests, measured and predicted", models=told, scene=scene.model_dump_json())
+    result = schema.to_dataset(values, attrs, _own())
     return result.assign(rmse=_rmse(result))
 
 
-_ATTRIBUTES = {
-    "throughput": {"units": "kg s-1", "long_name": "solids through the whole gap"},
-    "power": {"units": "W", "long_name": "power of both drives"},
-    "specific_energy": {"units": "J kg-1", "long_name": "power over throughput"},
-    "gap": {"units": "m", "long_name": "gap; of the measurement the thickness of the cake"},
-}
+def _own() -> dict[str, Any]:
+    """Return the table of the study's own variables."""
+    import numpy as np
+
+    from hpgr.results.schema import VARIABLES, Variable
+
+    dims = ("source", "test")
+    return {
+        **{name: VARIABLES[name]._replace(dims=dims, dtype=np.float64) for name in FIGURES},
+        "gap": Variable(dims, "m", "gap", "of the measurement the thickness of the cake", np.float64),
+        "passing": Variable((*dims, "part", "sieve"), "1", "mass fraction passing"),
+        "blind": Variable(("test",), "1", "whether the test was left out of the fit", dtype=np.int8),
+        "failure": Variable(dims, "", "why a model predicts nothing of a test", dtype=object),
+        "source": Variable(("source",), "", "measurement or model", dtype=object),
+        "test": Variable(("test",), "", "pilot test", dtype=object),
+        "part": Variable(("part",), "", "part of the roll width", dtype=object),
+    }
 
 
-def _predicted(model: Model, test: Any) -> Any:
-    """Return the prediction, or why there is none."""
+def _predicted(model: Model, test: Any) -> dict[str, Any]:
+    """Return the prediction by name, or why there is none as its failure."""
     try:
-        return model.predict(test)
+        return model.predict(test)._asdict()
     except ValueError as error:
-        return str(error)
+        return {"failure": str(error)}
 
 
 def _rmse(result: "xr.Dataset") -> "xr.DataArray":
@@ -270,27 +272,25 @@ def words(result: "xr.Dataset", models: Sequence[Model]) -> list[str]:
     """Return the tables of the study: fitted values, errors of every test, and what they come to blind."""
     lines = []
     for model in models:
-        lines += [f"{model.name}: {model.words}", *_table(result, model.name)]
-    lines += ["blind tests, percent passing of the total product:", *blind_summary(result)]
-    return lines
+        lines += [f"{model.name}: {model.words}", *_table(result, model.name).splitlines()]
+    return [*lines, "blind tests, percent passing of the total product:", *blind_summary(result)]
 
 
-def _table(result: "xr.Dataset", name: str) -> list[str]:
-    lines = [f"{'test':>10}{'centre':>9}{'edge':>9}{'total':>9}   RMSE, %{'Q':>9}{'P':>9}{'W':>9}   error, %"]
+def _table(result: "xr.Dataset", name: str) -> str:
+    from studies.show.report import aligned
+
+    rows = []
     for test in result["test"].values:
         one, measured = (result.sel(source=source, test=test) for source in (name, "measured"))
-        if one["failure"].item():
-            lines.append(f"{test:>10}  {one['failure'].item()}")
-            continue
-        shown = [_figure(one["rmse"].sel(part=part).item(), "9.2f") for part in PARTS]
-        errors = [_figure(100 * (one[key] / measured[key] - 1).item(), "+9.1f") for key in FIGURES]
-        blind = " blind" if one["blind"].item() else ""
-        lines.append(f"{test:>10}{''.join(shown)}          {''.join(errors)}{blind:>10}")
-    return lines
+        shown = [_figure(one["rmse"].sel(part=part).item(), ".2f") for part in PARTS]
+        errors = [_figure(100 * (one[key] / measured[key] - 1).item(), "+.1f") for key in FIGURES]
+        rows.append([test, *shown, *errors, "blind" if one["blind"].item() else "", one["failure"].item()])
+    headings = ["test", *(f"RMSE {part} [%]" for part in PARTS), "error of Q [%]", "P [%]", "W [%]", "", ""]
+    return aligned(headings, rows, words=1)
 
 
 def _figure(value: float, form: str) -> str:
-    return f"{'-':>9}" if math.isnan(value) else format(value, form)
+    return "-" if math.isnan(value) else format(value, form)
 
 
 def blind_summary(result: "xr.Dataset") -> list[str]:
@@ -304,8 +304,8 @@ def blind_summary(result: "xr.Dataset") -> list[str]:
         one = blind.sel(source=name)
         total = one["rmse"].sel(part="total")
         worst = [float(abs(100 * (one[key] / measured[key] - 1)).max()) for key in ("throughput", "power")]
-        errors = ", ".join(f"{key} within {_figure(value, '.1f').strip()} %"
-                           for key, value in zip(("throughput", "power"), worst, strict=True))  # fmt: skip
+        named = zip(("throughput", "power"), worst, strict=True)
+        errors = ", ".join(f"{key} within {_figure(value, '.1f')} %" for key, value in named)
         lines.append(f"  {name}: median {float(total.median()):.2f}, largest {float(total.max()):.2f}; {errors}")
     return lines
 

@@ -28,10 +28,15 @@ def pilot_figure(result: xr.Dataset) -> Figure:
     figure_errors(panels[tests.size], result, sources)
     for panel in panels[tests.size + 1 :]:
         panel.set_axis_off()
-    parts = [Line2D([], [], marker=mark, color=_colour(k), linestyle="none", label=f"measured, {part}")
-             for k, (part, mark) in enumerate(_MARKERS.items())]  # fmt: skip
-    lines = [Line2D([], [], color="0.3", linestyle=_LINES[k % len(_LINES)], label=name)
-             for k, name in enumerate(sources) if _drawn(name)]  # fmt: skip
+    parts = [
+        Line2D([], [], marker=mark, color=_colour(k), linestyle="none", label=f"measured, {part}")
+        for k, (part, mark) in enumerate(_MARKERS.items())
+    ]
+    lines = [
+        Line2D([], [], color="0.3", linestyle=_LINES[k % len(_LINES)], label=name)
+        for k, name in enumerate(sources)
+        if _drawn(name)
+    ]
     figure.legend(handles=parts + lines, loc="outside upper center", ncols=4, fontsize=9)
     figure.supxlabel(
         "Lines: predicted; centre and edge are of the roll width. The other models are drawn for the total only.",
@@ -68,13 +73,24 @@ def figure_errors(panel, result: xr.Dataset, sources: list[str]) -> None:
             off = 100 * (result[name].sel(source=source) / measured[name] - 1).values
             if np.isfinite(off).any():
                 shift = 0.12 * (k - 1) + 0.035 * (j - 1)
-                panel.plot(place + shift, off, mark, color=_colour(k), fillstyle="full" if j == 0 else "none",
-                           markersize=6, label=name.replace("_", " ") if j == 0 else None)  # fmt: skip
+                panel.plot(
+                    place + shift,
+                    off,
+                    mark,
+                    color=_colour(k),
+                    fillstyle="full" if j == 0 else "none",
+                    markersize=6,
+                    label=name.replace("_", " ") if j == 0 else None,
+                )
     for side in (-10, 10):
         panel.axhline(side, color="0.6", linewidth=0.8, linestyle=":")
     panel.axhline(0, color="0.3", linewidth=0.8)
-    panel.set_xticks(place, [f"{name}{'' if blind else ' (fitted)'}" for name, blind in
-                             zip(tests, result["blind"].values, strict=True)], rotation=30, fontsize=8)  # fmt: skip
+    panel.set_xticks(
+        place,
+        [f"{name}{'' if blind else ' (fitted)'}" for name, blind in zip(tests, result["blind"].values, strict=True)],
+        rotation=30,
+        fontsize=8,
+    )
     panel.set(ylabel="predicted over measured - 1 [%]")
     panel.set_title(f"full: {sources[0]}; hollow: other models; dotted: 10 %", fontsize=10)
     panel.legend(fontsize=8)

@@ -1,23 +1,31 @@
-"""Sweep -> what the explorer's page holds: plain lists and text, ready for JSON.
+"""Sweep -> the page of the explorer: what it holds, plain lists and text ready for JSON, and the page itself.
 
 Numbers are means and sample standard deviations over the replicates that hold a result, in the units people read.
 Arrays are flat, operating points slowest, in the order of the swept axes; None stands for NaN.
 """
 
+import base64
+import gzip
+import html
 import itertools
 import json
 import math
-from collections.abc import Iterable
+import re
+from collections import Counter
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from pydantic import ValidationError
 
-from hpgr import feed, metrics, units
-from hpgr.scene import Feed, Scene
-from studies import report
-from studies.sweep import STATUS
+from hpgr.fields import show, unit_shown
+from hpgr.laws.feed import Feed
+from hpgr.results import metrics
+from hpgr.results.schema import STATUS
+from hpgr.scene import Scene
+from studies.show import report
+from studies.sweep.netcdf import scene_of
 
 MOST_NUMBERS = 4_000_000  # in a page: about 30 MB, which a browser still opens in seconds
 DIGITS, SPREAD_DIGITS = 6, 4  # significant digits of means (float32 has about 7) and of standard deviations
@@ -47,7 +55,7 @@ def page_data(result: xr.Dataset, sieve: float, name: str) -> dict[str, Any]:
     Examples
     --------
     >>> import hpgr
-    >>> from studies.explore_data import page_data
+    >>> from studies.show.page import page_data
     >>> from studies.sweep import sweep
     >>> base = hpgr.presets.paper().with_values({"resolution.cells": 100, "resolution.points": 50})
     >>> data = page_data(sweep(base, {"rolls.gap": ["40 mm", "60 mm"]}), 0.001, "two gaps")
@@ -56,10 +64,10 @@ def page_data(result: xr.Dataset, sieve: float, name: str) -> dict[str, Any]:
     """
     require_sweep(result, name)
     axes = report.axes_of(result)
-    scene = Scene.model_validate_json(result.attrs["scene"])
+    scene = scene_of(result)
     points = report.operating_points(result)
     feeds, feed_of = feeds_of(result, scene)
-    sieved = with_sieve(result, sieve, max((one.coarsest for one in feeds if one), default=0.0))
+    sieved = with_sieve(result, sieve, max((one.largest_grain for one in feeds if one), default=0.0))
     refuse_too_many(result, sieved.get("sieve"), name)
     sizes = {key: entry(values_of(report.operating_points(sieved), key)) for key in sieved.data_vars}
     shown_sieves = sieved["sieve"].values if sizes else np.array([])
@@ -79,22 +87,22 @@ def page_data(result: xr.Dataset, sieve: float, name: str) -> dict[str, Any]:
         "sieves": numbers(shown_sieves * 1e3),
         "sieve": int(np.argmin(np.abs(shown_sieves - sieve))) if sizes else 0,
         "passing": sizes,
-        "feeds": [numbers(feed.passing(one, shown_sieves)) if one and sizes else None for one in feeds],
+        "feeds": [numbers(one.passing(shown_sieves)) if one and sizes else None for one in feeds],
         "feed_of": feed_of,
         "scene": json.loads(result.attrs["scene"]),
-    }  # fmt: skip
+    }
 
 
 def told(result: xr.Dataset) -> list[str]:
-    """Return what a page says of the whole sweep: notes, limits, lost cases."""
+    """Return what a page says of the whole sweep: its remark, limits, lost cases."""
     lost = report.lost_cases(result)
     more = [f"and {len(lost) - _MOST_LOST} more lost operating points"] if len(lost) > _MOST_LOST else []
-    return report.notes(result) + lost[:_MOST_LOST] + more
+    return report.remarks(result) + lost[:_MOST_LOST] + more
 
 
 def require_sweep(result: xr.Dataset, name: str) -> None:
     """Raise ValueError if a Dataset is not of a sweep, or holds no result at all."""
-    lacking = [each for each in ("replicate", "status", "message", "notes") if each not in result.variables]
+    lacking = [each for each in ("replicate", "status", "message", "diagnostics") if each not in result.variables]
     lacking += [] if "scene" in result.attrs else ["the attribute scene"]
     if lacking:
         raise ValueError(
@@ -144,7 +152,7 @@ def numbers(values: np.ndarray, digits: int = DIGITS) -> list:
     Examples
     --------
     >>> import numpy as np
-    >>> from studies.explore_data import numbers
+    >>> from studies.show.page import numbers
     >>> numbers(np.array([0.123456789, 3.0, np.nan]))
     [0.123457, 3, None]
     """
@@ -164,7 +172,7 @@ def kpis(points: xr.Dataset, sieve: float) -> list[dict[str, Any]]:
     first = report.figures(points, sieve)
     known = {heading: (values.where(ok), "") for heading, values in first.items() if not heading.startswith("below ")}
     for name in of_dims(points, set(_CASE)):
-        if name not in ("status", "flags", *report.READ):
+        if name not in ("status", "flags", *report.PRODUCT):
             known[heading_of(points[name])] = (shown(points, name), points[name].attrs.get("long_name", ""))
     return [
         {"heading": heading, "about": about} | entry(values.transpose(*_CASE))
@@ -188,7 +196,7 @@ def of_dims(points: xr.Dataset, dims: set[str]) -> list[str]:
 
 def shown(points: xr.Dataset, name: str) -> xr.DataArray:
     """Return a variable in the unit it is shown in."""
-    return values_of(points, name) * units.SHOWN.get(points[name].attrs.get("units", "1"), ("", 1.0))[1]
+    return values_of(points, name) * unit_shown(points[name].attrs.get("units", "1"))[1]
 
 
 def heading_of(variable: xr.DataArray) -> str:
@@ -196,14 +204,14 @@ def heading_of(variable: xr.DataArray) -> str:
     words = variable.name.replace("_", " ").removesuffix(" total")
     words = words[0].upper() + words[1:] if words in ("p50", "p80") else words
     unit = variable.attrs.get("units", "1")
-    return words if unit == "1" else f"{words} [{units.SHOWN.get(unit, (unit,))[0]}]"
+    return words if unit == "1" else f"{words} [{unit_shown(unit)[0]}]"
 
 
-def with_sieve(result: xr.Dataset, sieve: float, coarsest: float) -> xr.Dataset:
+def with_sieve(result: xr.Dataset, sieve: float, largest: float) -> xr.Dataset:
     """Return the mass fractions passing, at the sieves that tell something and at `sieve`; none if stress only.
 
-    Left out are sieves that nothing passes, and that everything passes of products and of feeds, whose coarsest grain
-    is `coarsest` (m), but for the last and the first of them.
+    Left out are sieves that nothing passes, and that everything passes of products and of feeds, whose largest grain
+    is `largest` (m), but for the last and the first of them.
     """
     kept = result[[name for name in ("passing_total", "passing") if name in result]]
     if not kept.data_vars:
@@ -211,13 +219,13 @@ def with_sieve(result: xr.Dataset, sieve: float, coarsest: float) -> xr.Dataset:
     known = kept["sieve"].values
     if not known[0] <= sieve <= known[-1]:
         raise ValueError(
-            f"--sieve: got {units.show(sieve, 'm')}; must lie within the recorded sieves, "
-            f"{units.show(known[0], 'm')} to {units.show(known[-1], 'm')}; choose one within"
+            f"--sieve: got {show(sieve, 'm')}; must lie within the recorded sieves, "
+            f"{show(known[0], 'm')} to {show(known[-1], 'm')}; choose one within"
         )
     across = [name for name in kept["passing_total"].dims if name != "sieve"]
     first = max(int(np.argmax(kept["passing_total"].max(across).values > 0)) - 1, 0)
     beyond = kept["passing_total"].min(across).values >= 1
-    beyond &= known >= coarsest
+    beyond &= known >= largest
     last = int(np.argmax(beyond)) if beyond.any() else known.size - 1
     if np.isclose(known, sieve, rtol=1e-9).any():
         sieve = known[np.argmin(np.abs(known - sieve))]
@@ -240,7 +248,7 @@ def axis_data(axis: xr.DataArray, scene: Scene) -> dict[str, Any]:
         "about": axis.attrs.get("long_name", ""),
         "field": field,
         "values": numbers(values) if numeric and np.isfinite(values).all() else None,
-        "texts": [units.show(value, unit) if numeric else str(value) for value in raw],
+        "texts": [show(value, unit) if numeric else str(value) for value in raw],
         "order": np.argsort(values, kind="stable").tolist() if numeric else list(range(axis.size)),
         "raw": [_plain(value) for value in raw],
         "changes": [changes(scene, field, value) for value in raw],
@@ -253,15 +261,17 @@ def _plain(value: Any) -> Any:
 
 
 def changes(scene: Scene, field: str, value: Any) -> dict[str, Any]:
-    """Return the fields, by dotted name, that a scene changes when one is given a value; a level changes several."""
+    """Return the fields, by dotted name, that a scene changes when one is given a value; None for one that it drops."""
     try:
         other = scene.with_values({field: value})
     except ValidationError:  # a case that was refused
         return {field: _plain(value)}
-    before, after = (json.loads(one.model_dump_json()) for one in (scene, other))
     section = field.partition(".")[0]
-    old = before[section] or {}
-    return {f"{section}.{key}": new for key, new in after[section].items() if key not in old or old[key] != new}
+    before, after = (json.loads(one.model_dump_json())[section] or {} for one in (scene, other))
+    dropped = {key: None for key in before if key not in after}
+    return {
+        f"{section}.{key}": new for key, new in (after | dropped).items() if key not in before or before[key] != new
+    }
 
 
 def start(result: xr.Dataset, scene: Scene, held: np.ndarray) -> list[int]:
@@ -309,18 +319,52 @@ def _feed(scene: Scene, values: dict[str, Any]) -> Feed | None:
 def said(point: xr.Dataset) -> list[list]:
     """Return what became of an operating point, as [what, replicates it holds for, words], lost cases first."""
     words = {number: word for word, number in STATUS.items()}
-    status, messages, notes = (np.atleast_1d(point[name].values) for name in ("status", "message", "notes"))
-    lost = [(words[int(state)], str(text)) for state, text in zip(status, messages, strict=True) if state]
-    counted = [[what, count, text] for (what, text), count in _counts(lost)]
-    lines = [line.partition(": ") for note in notes for line in str(note).splitlines()]
+    status, messages, told = (np.atleast_1d(point[name].values) for name in ("status", "message", "diagnostics"))
+    lost = Counter((words[int(state)], str(text)) for state, text in zip(status, messages, strict=True) if state)
+    lines = [line.partition(": ") for each in told for line in str(each).splitlines()]
     first = {name: text for name, _, text in reversed(lines)}
-    return counted + [
-        [name.replace("_", " "), count, first[name]] for name, count in _counts(line[0] for line in lines)
+    limits = Counter(name for name, *_ in lines)
+    return [
+        *([what, count, text] for (what, text), count in lost.items()),
+        *([name.replace("_", " "), count, first[name]] for name, count in limits.items()),
     ]
 
 
-def _counts(values: Iterable) -> list[tuple[Any, int]]:
-    found: dict[Any, int] = {}
-    for value in values:
-        found[value] = found.get(value, 0) + 1
-    return list(found.items())
+def page_of(data: dict[str, Any], library: str, history: str = "") -> str:
+    """Return the page as text.
+
+    Parameters
+    ----------
+    data : dict
+        From `page_data`.
+    library : str
+        Source of plotly.js, which is packed to two fifths of its size; browsers since 2023 unpack it.
+    history : str
+        The command that made it.
+
+    Examples
+    --------
+    >>> from studies.show.page import page_of
+    >>> "<title>a &lt; b" in page_of({"name": "a < b"}, "")
+    True
+    """
+    packed = base64.b64encode(gzip.compress(library.encode(), 9, mtime=0)).decode()
+    parts = {"TITLE": html.escape(data["name"]), "HISTORY": html.escape(history)}
+    parts |= {"DATA": embedded(data), "LIBRARY": packed}
+    template = (files("studies.show") / "page.html").read_text(encoding="utf-8")
+    return re.sub("@@([A-Z]+)@@", lambda found: parts[found[1]], template)
+
+
+def embedded(data: dict[str, Any]) -> str:
+    r"""Return data as JSON that no text in it can end the script element of.
+
+    Examples
+    --------
+    >>> from studies.show.page import embedded
+    >>> embedded({"remark": "</script>"})
+    '{"remark":"\\u003c/script\\u003e"}'
+    """
+    text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    for mark in "<>&\u2028\u2029":
+        text = text.replace(mark, f"\\u{ord(mark):04x}")
+    return text

@@ -9,14 +9,15 @@ import cmcrameri.cm as maps
 import numpy as np
 import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LogNorm
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from matplotlib.ticker import NullFormatter
 from PIL import Image
 
-from hpgr import units
+from hpgr.fields import show
 from hpgr.scene import Scene
-from studies.plots.bed import draw_cells, draw_rolls
 
 _POSITIONS = 5  # of the stream tubes, at most, whose product is drawn
 _DASHES = ("-", (0, (6, 1.5)), (0, (3, 1.2)), (0, (4, 1, 1, 1)), (0, (1, 1)))
@@ -41,11 +42,11 @@ def figure3(result: xr.Dataset) -> Figure:
     step = 1e3 * float(result["shown_time_step"])
     panels[2].set_title(f"(c) Material points, Δt = {step:.3g} ms apart")
     outlines, volumes = _outlines(result, 1e6 * result["volume"].values)
-    drawn = draw_cells(panels[3], outlines, volumes, LogNorm(volumes.min(), volumes.max()))
+    drawn = _draw_cells(panels[3], outlines, volumes, LogNorm(volumes.min(), volumes.max()))
     bar = figure.colorbar(drawn[0], ax=panels[3], label="volume per roll width [mm²]", shrink=0.85)
     _plain(bar)
     panels[3].set_title("(d) Volumes of the material points")
-    leaves = units.show(float(f"{result.attrs['streamline_deviation_m']:.2g}"), "m")
+    leaves = show(float(f"{result.attrs['streamline_deviation_m']:.2g}"), "m")
     _caption(figure, result, f"Grey: rolls, which the outermost streamline, a cubic, leaves by {leaves} at most.")
     return figure
 
@@ -115,8 +116,15 @@ def _sizes_across(panel, result: xr.Dataset) -> None:
     across = np.concatenate([-xi[::-1], xi])
     for name, marker, dash, lightness in (("p80", "o", "-", "0"), ("p50", "s", "--", "0.45")):
         values = 1e3 * result[name].values
-        panel.plot(across, np.concatenate([values[::-1], values]), marker=marker, linestyle=dash, color=lightness,
-                   markersize=4, label=name.upper())  # fmt: skip
+        panel.plot(
+            across,
+            np.concatenate([values[::-1], values]),
+            marker=marker,
+            linestyle=dash,
+            color=lightness,
+            markersize=4,
+            label=name.upper(),
+        )
     for roll in (-1, 1):
         panel.axvline(roll, color="0.3", linewidth=3)
     panel.set(xlabel="position across the gap, roll to roll [half gaps]", ylabel="product size [mm]", xlim=(-1, 1))
@@ -126,8 +134,8 @@ def _sizes_across(panel, result: xr.Dataset) -> None:
     panel.grid(color="0.9")
 
 
-def startup_animation(result: xr.Dataset, path: Path) -> None:
-    """Write the GIF of local P80 from the first fill to the steady machine, a frame per photograph."""
+def startup_animation(result: xr.Dataset, path: Path, comment: str = "") -> None:
+    """Write the GIF of local P80 from the first fill to the steady machine, a frame per snapshot."""
     figure = Figure(figsize=(5.2, 5.9), dpi=100)
     canvas = FigureCanvasAgg(figure)
     panel = figure.add_axes((0.14, 0.155, 0.66, 0.77))
@@ -135,7 +143,7 @@ def startup_animation(result: xr.Dataset, path: Path) -> None:
     frames = 1e3 * result["startup_p80"].values
     norm = LogNorm(frames.min(), frames.max())
     outlines, first = _outlines(result, frames[0])
-    cells = draw_cells(panel, outlines, first, norm)
+    cells = _draw_cells(panel, outlines, first, norm)
     for part in cells:
         part.set(edgecolors="face", linewidths=0.3)
     bar = figure.colorbar(cells[0], cax=figure.add_axes((0.83, 0.2, 0.035, 0.68)), label="local P80 [mm]")
@@ -152,7 +160,9 @@ def startup_animation(result: xr.Dataset, path: Path) -> None:
     palette = images[len(images) // 2].quantize(_COLOURS)  # one for all: frames then differ only where the bed does
     indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     shown = [_FIRST if k < _SLOW else _FRAME for k in range(len(indexed) - 1)] + [_LAST]
-    indexed[0].save(path, format="GIF", save_all=True, append_images=indexed[1:], duration=shown, loop=0)
+    indexed[0].save(
+        path, format="GIF", save_all=True, append_images=indexed[1:], duration=shown, loop=0, comment=comment.encode()
+    )
 
 
 def _startup_words(result: xr.Dataset) -> str:
@@ -165,10 +175,45 @@ def _startup_words(result: xr.Dataset) -> str:
     )
 
 
+def _draw_cells(
+    panel, outlines: list[np.ndarray], values: np.ndarray, norm: Normalize, cmap=maps.batlow
+) -> list[PolyCollection]:
+    """Draw cells of the right half (outlines in m), coloured by `values`, and their mirror images; return both."""
+    drawn = []
+    for side in (1, -1):
+        part = PolyCollection(
+            [1e3 * outline * (side, 1) for outline in outlines],
+            array=values,
+            cmap=cmap,
+            norm=norm,
+            edgecolors="0.2",
+            linewidths=0.25,
+        )
+        panel.add_collection(part)
+        drawn.append(part)
+    return drawn
+
+
+def _draw_rolls(panel, radius: float, axis: float, half_width: float, height: float) -> None:
+    """Draw both rolls (lengths in m) behind a bed of this size, and set the panel's limits, aspect and labels in mm.
+
+    `axis` is the distance of the roll axes from the mid-plane, `half_width` that of the bed at its top.
+    """
+    for side in (-1, 1):
+        panel.add_patch(Circle((side * 1e3 * axis, 0), 1e3 * radius, facecolor="0.85", edgecolor="0.3", zorder=0))
+    panel.set(
+        xlabel="x across the gap [mm]",
+        ylabel="height above the minimum gap [mm]",
+        xlim=(-1.25e3 * half_width, 1.25e3 * half_width),
+        ylim=(-0.06e3 * height, 1.04e3 * height),
+        aspect="equal",
+    )
+
+
 def _rolls(panel, result: xr.Dataset) -> None:
     height = float((result["height"] + result["mid_gap_depth"]).max())
     half_width = float(result["x"].max())
-    draw_rolls(panel, float(result["roll_radius"]), float(result["roll_axis_x"]), half_width, height)
+    _draw_rolls(panel, float(result["roll_radius"]), float(result["roll_axis_x"]), half_width, height)
 
 
 def _streamlines(panel, result: xr.Dataset) -> None:
@@ -272,11 +317,11 @@ def _caption(figure: Figure, result: xr.Dataset, words: str, limits: bool = Fals
     rolls = scene.rolls
     exchange = "without exchange" if scene.exchange is None else "with segregation and mixing"
     about = (
-        f"Rolls {units.show(rolls.diameter, 'm')}, gap {units.show(rolls.gap, 'm')}, entry gap "
-        f"{units.show(rolls.entry_gap, 'm')}, {30 / np.pi * rolls.speed:.3g} rpm; {scene.feed.kind} feed to "
-        f"{units.show(scene.feed.coarsest, 'm')}; {exchange}."
+        f"Rolls {show(rolls.diameter, 'm')}, gap {show(rolls.gap, 'm')}, entry gap "
+        f"{show(rolls.entry_gap, 'm')}, {30 / np.pi * rolls.speed:.3g} rpm; {scene.feed.kind} feed to "
+        f"{show(scene.feed.largest_grain, 'm')}; {exchange}."
     )
-    hit = [line.partition(": ")[2] for line in result.attrs["notes"].splitlines()] if limits else []
+    hit = [line.partition(": ")[2] for line in result.attrs["diagnostics"].splitlines()] if limits else []
     hit = [line[0].upper() + line[1:] + "." for line in hit]
-    note = [f"Scene: {scene.note}."] if scene.note else []
-    figure.supxlabel("\n".join(line for line in (about, words, *hit, *note) if line), fontsize=8)
+    remark = [f"Scene: {scene.remark}."] if scene.remark else []
+    figure.supxlabel("\n".join(line for line in (about, words, *hit, *remark) if line), fontsize=8)

@@ -1,11 +1,13 @@
 """Figures of `studies.accuracy`: error against cost."""
 
+import itertools
+
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullFormatter
 
-from studies.plots.sweeps import MARKERS
+from studies.show.plots.sweeps import MARKERS
 
 _LADDER_PANELS = (  # ladder, variant, title
     ("points", "scene", "Points (dt), the scene as it is"),
@@ -13,7 +15,7 @@ _LADDER_PANELS = (  # ladder, variant, title
     ("points", None, "Points (dt), the other integrator"),
     ("streamlines", "", "Streamlines N"),
     ("cells", "", "Cells M"),
-    ("photographs", "", "Photographs"),
+    ("snapshots", "", "Snapshots"),
 )
 _ERROR_LINES = (  # quantity, kind, label, marker, dash, lightness
     ("p80", "bias", "bias of P80", "o", "-", "0.0"),
@@ -63,16 +65,13 @@ def work_precision(panel, result: xr.Dataset) -> None:
     error = np.maximum(100 * result["combination_worst_error"].values, 1e-4)  # none at all has no place on log axes
     lines, points = result["combination_streamlines"].values, result["combination_points"].values
     every = np.unique(points)
-    for k, count in enumerate(np.unique(lines)):
-        for j, points_now in enumerate(every):
+    shades = {points_now: str(1 - j / max(every.size - 1, 1)) for j, points_now in enumerate(every)}
+    for count, marker in zip(np.unique(lines), itertools.cycle(MARKERS), strict=False):
+        for points_now, shade in shades.items():
             mine = (lines == count) & (points == points_now)
-            shade = str(1 - j / max(every.size - 1, 1))
-            panel.scatter(
-                milliseconds[mine], error[mine], marker=MARKERS[k % len(MARKERS)], c=shade, edgecolors="0.2", s=42
-            )
-        panel.scatter([], [], marker=MARKERS[k % len(MARKERS)], c="0.7", edgecolors="0.2", label=f"N = {count}")
-    for j, points_now in enumerate(every):
-        shade = str(1 - j / max(every.size - 1, 1))
+            panel.scatter(milliseconds[mine], error[mine], marker=marker, c=shade, edgecolors="0.2", s=42)
+        panel.scatter([], [], marker=marker, c="0.7", edgecolors="0.2", label=f"N = {count}")
+    for points_now, shade in shades.items():
         panel.scatter([], [], marker="o", c=shade, edgecolors="0.2", label=f"P = {points_now}")
     front = np.flatnonzero(result["combination_on_front"].values)
     front = front[np.argsort(milliseconds[front])]
@@ -80,8 +79,14 @@ def work_precision(panel, result: xr.Dataset) -> None:
     for k in np.flatnonzero(result["combination_level"].values != ""):
         where = (milliseconds[k], error[k])
         panel.plot(*where, marker="o", markersize=15, fillstyle="none", color="black", markeredgewidth=1.6)
-        panel.annotate(str(result["combination_level"].values[k]), where, (55, 28), textcoords="offset points",
-                       fontweight="bold", arrowprops={"arrowstyle": "-", "shrinkB": 8})  # fmt: skip
+        panel.annotate(
+            str(result["combination_level"].values[k]),
+            where,
+            (55, 28),
+            textcoords="offset points",
+            fontweight="bold",
+            arrowprops={"arrowstyle": "-", "shrinkB": 8},
+        )
     panel.set(xscale="log", yscale="log", xlabel="median wall time of a run [ms]")
     panel.set_ylim(0.8 * error.min(), 2 * error.max())
     panel.set_ylabel("largest error of P50, P80 and percent below 1 mm: |bias| + 2 standard errors [%]")
@@ -102,8 +107,16 @@ def ladder_errors(panel, result: xr.Dataset, name: str, title: str) -> None:
         values = 100 * np.abs(one[f"{name}_{kind}"].values)
         least = 100 * one[f"{name}_bias_error"].values if kind == "bias" else np.zeros(values.size)
         seen = (values > least) & (values > 1e-9)
-        panel.plot(milliseconds[seen], values[seen], marker=marker, linestyle=dash, color=lightness, label=label,
-                   markersize=4.5, linewidth=1.2)  # fmt: skip
+        panel.plot(
+            milliseconds[seen],
+            values[seen],
+            marker=marker,
+            linestyle=dash,
+            color=lightness,
+            label=label,
+            markersize=4.5,
+            linewidth=1.2,
+        )
         highest = max(highest, values[seen].max(initial=0.0))
     panel.set(xscale="log", title=title, xlim=(milliseconds.min() / 1.1, milliseconds.max() * 1.1))
     panel.set_xlabel("wall time of a run [ms]", labelpad=1)
@@ -124,8 +137,15 @@ def _number_rungs(panel, rungs: np.ndarray, places: np.ndarray) -> None:
     for rung, where, place in zip(rungs, places, across, strict=True):
         if all(abs(place - other) > 0.05 for other in taken):
             taken.append(place)
-            panel.annotate(str(rung), (where, 0.985), xycoords=("data", "axes fraction"), rotation=90, fontsize=8,
-                           ha="center", va="top")  # fmt: skip
+            panel.annotate(
+                str(rung),
+                (where, 0.985),
+                xycoords=("data", "axes fraction"),
+                rotation=90,
+                fontsize=8,
+                ha="center",
+                va="top",
+            )
 
 
 def _plain_numbers(panel) -> None:

@@ -10,9 +10,9 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from hpgr import units
-from hpgr.scene import Scene
-from studies import report
+from hpgr.fields import show
+from studies.show import report
+from studies.sweep.netcdf import scene_of
 
 _MOST_LINES = 7  # operating points a panel shows; more are thinned evenly, and the figure says so
 MARKERS = "os^Dv<>"
@@ -50,9 +50,9 @@ def sweep_figure(result: xr.Dataset, field: str, sieve: float, caption: str) -> 
         words.append(f"Panels show at most {_MOST_LINES} of the operating points, evenly chosen.")
     if result.sizes["replicate"] > 1:
         words.append(f"Mean of {result.sizes['replicate']} replicates; bars: ± one standard deviation.")
-    words += [line[0].upper() + line[1:] + "." for line in report.flags(result)]
-    note = Scene.model_validate_json(result.attrs["scene"]).note
-    words += [f"Scene: {note}."] if note else []
+    words += [line[0].upper() + line[1:] + "." for line in report.flagged(result)]
+    remark = scene_of(result).remark
+    words += [f"Scene: {remark}."] if remark else []
     width = int(14 * figure.get_figwidth())  # letters
     folded = [textwrap.fill(line, width) for line in "\n".join(words).splitlines()]
     figure.supxlabel("\n".join(folded), fontsize=9)
@@ -71,7 +71,7 @@ def fineness_across_gap(left, right, result: xr.Dataset, sieve: float) -> bool:
             _, bars = _mirrored(result["xi"].values, report.spread(one).values)
             panel.errorbar(position, mean, None if np.isnan(bars).all() else bars, label=label, **style)
     left.set(ylabel="P80 [mm]", title="Product size across the gap")
-    right.set(ylabel=f"below {units.show(sieve, 'm')} [%]", title="Fineness across the gap")
+    right.set(ylabel=f"below {show(sieve, 'm')} [%]", title="Fineness across the gap")
     for panel in (left, right):
         panel.set_xlabel("position across the gap, roll to roll [half gaps]")
         panel.set_xlim(-1, 1)
@@ -113,7 +113,7 @@ def against_axis(panel, values: xr.DataArray, axis: xr.DataArray, heading: str) 
     for k in range(lines.sizes["line"]):
         one = lines.isel(line=k).transpose(axis.name, "replicate")
         bars = report.spread(one).values
-        label = ", ".join(_value(lines[name].values[k], values[name]) for name in others)
+        label = ", ".join(report.value_text(values[name], lines[name].values[k]) for name in others)
         style = _style(k, lines.sizes["line"]) | {"color": str(0.6 * k / max(lines.sizes["line"] - 1, 1))}
         error = None if np.isnan(bars).all() else bars[order]
         panel.errorbar(shown[order], one.mean("replicate").values[order], error, label=label or None, **style)
@@ -135,7 +135,7 @@ def _shown_points(result: xr.Dataset) -> tuple[xr.Dataset, list[str], bool]:
     held = np.flatnonzero(points["p80_total"].notnull().any("replicate").values)
     chosen = _thinned(held)
     axes = report.axes_of(result)
-    labels = [", ".join(_value(points[name].values[k], result[name]) for name in axes) for k in chosen]
+    labels = [", ".join(report.value_text(result[name], points[name].values[k]) for name in axes) for k in chosen]
     return points.isel(operating_point=chosen), labels, chosen.size < held.size
 
 
@@ -147,10 +147,6 @@ def _thinned(numbers: np.ndarray) -> np.ndarray:
 
 def _joined(names: list[str]) -> str:
     return ", ".join(name.replace("_", " ") for name in names)
-
-
-def _value(value, axis: xr.DataArray) -> str:
-    return units.show(float(value), axis.attrs["units"]) if axis.dtype.kind in "fiu" else str(value)
 
 
 def _mirrored(xi: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,30 +11,21 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from hpgr import units
+from hpgr.fields import unit_shown
+from hpgr.results import flags
 
-_LETTERS = {  # flag -> letter in a map
-    "solid_fraction_capped": "C",
-    "single_particle_nipping": "N",
-    "no_compaction": "D",
-    "no_breakage": "B",
-    "size_floor_reached": "F",
-    "tension_clamped": "T",
-    "few_cells": "M",
-    "no_limit_of_steps": "L",
-}
-_MEANINGS = {
-    "C": "solid fraction capped",
-    "N": "single grains nipped",
-    "D": "no compaction",
-    "B": "no grain breaks",
-    "F": "size floor reached",
-    "T": "tension held at 0",
-    "M": "few cells",
-    "L": "no limit of small steps",
+_LETTERS = {  # flag -> letter in a map, and its meaning
+    "solid_fraction_capped": ("C", "solid fraction capped"),
+    "single_particle_nipping": ("N", "single grains nipped"),
+    "no_compaction": ("D", "no compaction"),
+    "no_breakage": ("B", "no grain breaks"),
+    "size_floor_reached": ("F", "size floor reached"),
+    "tension_clamped": ("T", "tension held at 0"),
+    "few_cells": ("M", "few cells"),
+    "no_limit_of_steps": ("L", "no limit of small steps"),
 }
 _SHADES = ("white", "0.86", "0.68", "0.35", "black")  # ok, flagged, substepped, refused, fault
-_WORDS = ("·  ok", "flagged (letters)", "substepped (number of passes, letters)", "×  refused", "!  silent fault")
+_WORDS = ("·  ok", "flagged (letters)", "substepped (number of substeps, letters)", "×  refused", "!  silent fault")
 _TITLES = {
     "gap_speed": "Gap and roll speed",
     "cushioning_step": "Cushioning and time step",
@@ -43,13 +34,13 @@ _TITLES = {
 _ERROR_LEVELS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, np.inf)
 
 
-def stability_figure(result: xr.Dataset) -> Figure:
+def stability(result: xr.Dataset) -> Figure:
     """Return the maps of outcomes, a panel each.
 
     Parameters
     ----------
     result : xarray.Dataset
-        From `studies.stability.maps`.
+        From `studies.guard.maps.maps`.
     """
     names = [name for name in _TITLES if f"{name}_outcome" in result]
     figure = Figure(figsize=(6.2 * len(names), 7.4), layout="constrained")
@@ -62,11 +53,11 @@ def stability_figure(result: xr.Dataset) -> Figure:
         if kind < 4 or any((result[f"{name}_outcome"] == kind).any() for name in names)
     ]
     figure.legend(handles=patches, loc="outside upper center", ncols=len(patches), fontsize=10)
-    letters = ", ".join(f"{letter}: {_MEANINGS[letter]}" for letter in _MEANINGS if letter in seen)
+    letters = ", ".join(f"{letter}: {meaning}" for letter, meaning in _LETTERS.values() if letter in seen)
     figure.supxlabel(
-        f"Letters: {letters}. Refused: outside the range of the field, or too many passes.\n"
+        f"Letters: {letters}. Refused: outside the range of the field, or too many substeps.\n"
         "Paper's rolls with a bed that begins at a gap of 500 mm; segregation and mixing on. Narrow gaps and small "
-        "time steps bring points closer together: exchange then takes more passes, and below 1 mm too many.\nRoll "
+        "time steps bring points closer together: exchange then takes more substeps, and below 1 mm too many.\nRoll "
         "speed changes no outcome. Steps of 1/8 and longer miss the compaction near the gap. Exponents below 0 ask for "
         "tension at its onset once steps are small enough to see it. No scene ends without a word.",
         fontsize=10,
@@ -76,20 +67,26 @@ def stability_figure(result: xr.Dataset) -> Figure:
 
 def _outcomes(panel, result: xr.Dataset, name: str) -> set[str]:
     """Draw one map of outcomes; return the letters in it."""
-    outcome, flags, passes = (result[f"{name}_{part}"] for part in ("outcome", "flags", "passes"))
+    outcome, bits, substeps = (result[f"{name}_{part}"] for part in ("outcome", "flags", "substeps"))
     columns, rows = (result[dim] for dim in outcome.dims)
     panel.imshow(outcome.values.T, cmap=ListedColormap(_SHADES), vmin=-0.5, vmax=4.5, origin="lower", aspect="auto")
-    masks, meanings = flags.attrs["flag_masks"], flags.attrs["flag_meanings"].split()
     seen: set[str] = set()
     for i, j in np.ndindex(outcome.shape):
-        kind, said = int(outcome[i, j]), int(flags[i, j])
-        letters = "".join(_LETTERS[flag] for mask, flag in zip(masks, meanings, strict=True)
-                          if said & mask and flag in _LETTERS)  # fmt: skip
+        kind, said = int(outcome[i, j]), int(bits[i, j])
+        letters = "".join(_LETTERS[name][0] for name in flags.names(said) if name in _LETTERS)
         seen |= set(letters)
-        number = str(int(passes[i, j])) if kind == 2 else ""
+        number = str(int(substeps[i, j])) if kind == 2 else ""
         text = {0: "·", 3: "×", 4: "!"}.get(kind, "\n".join(filter(None, (number, letters))))
-        panel.text(i, j, text, ha="center", va="center", fontsize=7.5, color="white" if kind >= 3 else "black",
-                   linespacing=0.95)  # fmt: skip
+        panel.text(
+            i,
+            j,
+            text,
+            ha="center",
+            va="center",
+            fontsize=7.5,
+            color="white" if kind >= 3 else "black",
+            linespacing=0.95,
+        )
     panel.set_xticks(np.arange(columns.size), _ticks(columns), rotation=90)
     panel.set_yticks(np.arange(rows.size), _ticks(rows))
     panel.set(title=_TITLES[name], xlabel=_label(columns), ylabel=_label(rows))
@@ -97,13 +94,13 @@ def _outcomes(panel, result: xr.Dataset, name: str) -> set[str]:
     return seen
 
 
-def integrator_figure(result: xr.Dataset) -> Figure:
+def integrators(result: xr.Dataset) -> Figure:
     """Return the errors of the explicit rule beside those of the increments, over exponent, time step and strain.
 
     Parameters
     ----------
     result : xarray.Dataset
-        From `studies.stability.maps`.
+        From `studies.guard.maps.maps`.
     """
     figure = Figure(figsize=(13, 10.5), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True)
@@ -149,8 +146,14 @@ def _errors(panel, result: xr.Dataset, name: str) -> None:
         if settled[i, j]:
             text = f"{_percent(error[i, j])}\n{text}".strip()
         else:
-            panel.fill([i - 0.5, i + 0.5, i + 0.5, i - 0.5], [j - 0.5, j - 0.5, j + 0.5, j + 0.5], facecolor="white",
-                       hatch="///", edgecolor="0.6", linewidth=0)  # fmt: skip
+            panel.fill(
+                [i - 0.5, i + 0.5, i + 0.5, i - 0.5],
+                [j - 0.5, j - 0.5, j + 0.5, j + 0.5],
+                facecolor="white",
+                hatch="///",
+                edgecolor="0.6",
+                linewidth=0,
+            )
             ink = "black"
         panel.text(i, j, text, ha="center", va="center", fontsize=8, color=ink, linespacing=0.95)
     exponents = result["exponent"].values
@@ -179,14 +182,18 @@ def _grid(panel, shape: tuple[int, int]) -> None:
 def _ticks(axis: xr.DataArray) -> list[str]:
     if axis.attrs["scene_field"] == "resolution.points":
         return [f"1/{int(points) - 1}" if points > 2 else "1" for points in axis.values]
-    factor = units.SHOWN.get(axis.attrs["units"], ("", 1.0))[1]
+    factor = unit_shown(axis.attrs["units"])[1]
     return [f"{value * factor:.3g}" for value in axis.values]
 
 
 def _label(axis: xr.DataArray) -> str:
     if axis.attrs["scene_field"] == "resolution.points":
         return "time step dt [residence times]"
-    shown = units.SHOWN.get(axis.attrs["units"], (axis.attrs["units"],))[0]
-    words = {"material.cushioning": "cushioning constant n", "material.elastic_exponent": "elastic exponent c",
-             "rolls.gap": "gap", "rolls.speed": "roll speed"}[axis.attrs["scene_field"]]  # fmt: skip
+    shown = unit_shown(axis.attrs["units"])[0]
+    words = {
+        "strength.cushioning": "cushioning constant n",
+        "elasticity.exponent": "elastic exponent c",
+        "rolls.gap": "gap",
+        "rolls.speed": "roll speed",
+    }[axis.attrs["scene_field"]]
     return f"{words} [{'-' if shown == '1' else shown}]"

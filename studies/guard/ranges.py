@@ -1,16 +1,18 @@
 """The declared range of every scene field, read off the fields themselves: ends, values just outside, draws.
 
-A field that a scene gains later is walked and drawn without a line here.
+A field or a law that a scene gains later is walked and drawn without a line here.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from functools import cache
 from typing import Any, Literal, NamedTuple, get_args, get_origin
 
 import numpy as np
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
-from hpgr import budget
+from hpgr import cost
+from hpgr.fields import Frozen, kinds_of, parts_of
 from hpgr.scene import Scene
 
 _DECADES = 9  # over which values are drawn where a range begins at 0 or has no upper end
@@ -50,8 +52,7 @@ class Range(NamedTuple):
 
     def outside(self) -> list[float]:
         """Return the values nearest to the ends that are not allowed."""
-        low = self.low if self.low_open else self._next(self.low, -math.inf)
-        beyond = [low]
+        beyond = [self.low if self.low_open else self._next(self.low, -math.inf)]
         if math.isfinite(self.high):
             beyond.append(self.high if self.high_open else self._next(self.high, math.inf))
         return [int(value) if self.whole else value for value in beyond]
@@ -71,58 +72,66 @@ class Range(NamedTuple):
         value = min(max(value, low), high)
         return round(value) if self.whole else value
 
+    def draw(self, generator: np.random.Generator) -> float:
+        """Return a value within the range, at one of its ends once in ten."""
+        ends = self.ends()
+        return ends[generator.integers(len(ends))] if generator.random() < 0.1 else self.at(generator.random())
+
     def _next(self, value: float, towards: float) -> float:
-        if self.whole:
-            return value + math.copysign(1, towards)
-        return math.nextafter(value, towards)
+        return value + math.copysign(1, towards) if self.whole else math.nextafter(value, towards)
 
 
-def parts() -> dict[str, type[BaseModel]]:
-    """Return the models a scene is made of by name, those that may be None too."""
-    found = {}
-    for name, field in Scene.model_fields.items():
-        for kind in (field.annotation, *get_args(field.annotation)):
-            if isinstance(kind, type) and issubclass(kind, BaseModel):
-                found[name] = kind
-    return found
+def laws() -> dict[str, list[type[Frozen]]]:
+    """Return the models that each section of a scene may hold, by name; one for a section that is no union."""
+    found = {name: parts_of(field) for name, field in Scene.model_fields.items()}
+    return {name: parts for name, parts in found.items() if parts}
 
 
+@cache
 def numeric_fields() -> dict[str, Range]:
     """Return the range of every field that holds one number, by dotted name."""
-    found = {name: _range(field) for name, field in _fields() if _holds(field, float) or _holds(field, int)}
+    found = {name: _range(field) for name, field in _fields().items() if _holds(field, float) or _holds(field, int)}
     return {name: known for name, known in found.items() if known is not None}
 
 
+@cache
 def choices() -> dict[str, tuple]:
-    """Return the words or truth values of every field that is a choice, by dotted name."""
-    found = {}
-    for name, field in _fields():
-        if get_origin(field.annotation) is Literal:
-            found[name] = get_args(field.annotation)
-        elif field.annotation is bool:
+    """Return the words or truth values of every field that is a choice, by dotted name; kinds of laws are one."""
+    found = {
+        f"{section}.kind": tuple(kind for law in each for kind in kinds_of(law)) for section, each in laws().items()
+    }
+    for name, field in _fields().items():
+        if field.annotation is bool:
             found[name] = (False, True)
-    return found
+        elif get_origin(field.annotation) is Literal and not name.endswith(".kind"):
+            found[name] = get_args(field.annotation)
+    return {name: words for name, words in found.items() if words}
 
 
-def _fields() -> Iterator[tuple[str, Any]]:
-    for section, part in parts().items():
-        for key, field in part.model_fields.items():
-            yield f"{section}.{key}", field
+def _fields() -> dict[str, Any]:
+    every = [
+        (f"{name}.{key}", field)
+        for name, each in laws().items()
+        for law in each
+        for key, field in law.model_fields.items()
+    ]
+    return dict(reversed(every))  # of a name that several laws of a section have, the first
 
 
 def _holds(field: Any, kind: type) -> bool:
     """Return whether a field holds one number of this kind, be it optional."""
-    held = [field.annotation, *get_args(field.annotation)] if get_origin(field.annotation) is not tuple else []
-    return any(each is kind or (get_args(each) or (None,))[0] is kind for each in held if get_origin(each) is not tuple)
+    if get_origin(field.annotation) is tuple:
+        return False
+    held = [each for each in (field.annotation, *get_args(field.annotation)) if get_origin(each) is not tuple]
+    return any(each is kind or kind in get_args(each)[:1] for each in held)
 
 
 def _range(field: Any) -> Range | None:
     known = {}
-    for bound in field.metadata:
-        for key in ("gt", "ge", "lt", "le", "allow_inf_nan"):
-            if getattr(bound, key, None) is not None:
-                known[key] = getattr(bound, key)
-    if not {"gt", "ge"} & set(known):
+    for key in ("gt", "ge", "lt", "le", "allow_inf_nan"):
+        found = [getattr(bound, key) for bound in field.metadata if getattr(bound, key, None) is not None]
+        known |= dict.fromkeys([key], found[0]) if found else {}
+    if not {"gt", "ge"} & known.keys():
         return None
     return Range(
         low=float(known.get("gt", known.get("ge"))),
@@ -133,6 +142,9 @@ def _range(field: Any) -> Range | None:
         infinite=bool(known.get("allow_inf_nan")),
         optional=type(None) in get_args(field.annotation),
     )
+
+
+# --- random scenes --------------------------------------------------------------------------------------------------
 
 
 def draw(base: Scene, generator: np.random.Generator, exchange: bool, most_seconds: float) -> dict[str, Any]:
@@ -151,62 +163,49 @@ def draw(base: Scene, generator: np.random.Generator, exchange: bool, most_secon
     exchange : bool
         Whether the scene has exchange.
     most_seconds : float
-        Most that a run may cost by `hpgr.budget.predict`.
+        Most that a run may cost by `hpgr.cost.predict`.
     """
     chance = 1.0 if generator.random() < 0.5 else 0.15
-    apart = {"feed", "resolution"} | (set() if exchange else {"exchange"})  # drawn otherwise, or not at all
-    drawn: dict[str, Any] = {} if exchange else {"exchange": None}
-    for name, known in numeric_fields().items():
-        if name.partition(".")[0] not in apart and generator.random() < (0.1 if known.optional else chance):
-            drawn[name] = _draw_number(known, generator)
-    for name, words in choices().items():
-        if name.partition(".")[0] not in apart:
-            drawn[name] = words[generator.integers(len(words))]
+    width = not exchange and generator.random() < 0.5
+    drawn: dict[str, Any] = {}
+    for section in ("rolls", "bed", "flow", "elasticity", "strength", "fragments"):
+        drawn |= _draw_section(section, chance, generator)
+    for section, wanted in (("exchange", exchange), ("roll_width", width)):
+        drawn |= _draw_section(section, chance, generator) if wanted else {section: None}
     drawn |= _draw_gaps(drawn.get("rolls.diameter", base.rolls.diameter), generator)
-    ore = base.material  # the feed's solid fraction is at most the largest
-    fractions = {"material.feed_solid_fraction": ore.feed_solid_fraction,
-                 "material.max_solid_fraction": ore.max_solid_fraction}  # fmt: skip
-    fractions |= {name: drawn[name] for name in fractions if name in drawn}
-    drawn |= zip(fractions, sorted(fractions.values()), strict=True)
+    names = ("bed.feed_solid_fraction", "bed.max_solid_fraction")  # the feed's is at most the largest
+    fractions = [drawn.get(name, getattr(base.bed, name.partition(".")[2])) for name in names]
+    drawn |= dict(zip(names, sorted(fractions), strict=True))
     drawn |= _draw_feed(drawn.get("rolls.entry_gap", base.rolls.entry_gap), generator)
-    drawn |= _draw_resolution(exchange, generator)
-    _reconcile(base, drawn, exchange, generator)
+    drawn |= _draw_resolution(exchange, width, generator)
+    if drawn["flow.kind"] == "nip":
+        drawn |= _draw_nip(drawn.get("rolls.diameter", base.rolls.diameter), drawn, generator)
     return _affordable(base, drawn, most_seconds)
 
 
-def _reconcile(base: Scene, drawn: dict[str, Any], exchange: bool, generator: np.random.Generator) -> None:
-    """Take out what excludes each other: two nips or none, slices of the roll width with exchange or whole records."""
-    for name in ("flow.nip_angle", "flow.cake_solid_fraction"):
-        drawn.pop(name, None)
-    if drawn.get("flow.profile") == "nip":
-        drawn |= _draw_nip(base, drawn, generator)
-    width = [name for name in drawn if name.startswith("roll_width.")]
-    if exchange or generator.random() < 0.5:
-        for name in width:
-            del drawn[name]
-    elif width:
-        drawn["resolution.record"] = "product"
+def _draw_section(section: str, chance: float, generator: np.random.Generator) -> dict[str, Any]:
+    """Return a kind of law and values of its fields, each over its whole range with this chance."""
+    each = laws()[section]
+    law = each[generator.integers(len(each))]
+    drawn: dict[str, Any] = {f"{section}.kind": kind for kind in kinds_of(law)}
+    for name in (f"{section}.{key}" for key in law.model_fields):
+        known, words = numeric_fields().get(name), choices().get(name)
+        if known is not None and generator.random() < (0.1 if known.optional else chance):
+            drawn[name] = known.draw(generator)
+        elif words and not name.endswith(".kind"):
+            drawn[name] = words[generator.integers(len(words))]
+    return drawn or {section: {}}
 
 
-def _draw_nip(base: Scene, drawn: Mapping[str, Any], generator: np.random.Generator) -> dict[str, float]:
+def _draw_nip(diameter: float, drawn: Mapping[str, Any], generator: np.random.Generator) -> dict[str, Any]:
     """Return a nip angle within the bed, or, once in two, the cake's solid fraction that has such a nip."""
-    diameter = drawn.get("rolls.diameter", base.rolls.diameter)
     gap, entry_gap = drawn["rolls.gap"], drawn["rolls.entry_gap"]
-    feed, densest = (drawn[f"material.{name}_solid_fraction"] for name in ("feed", "max"))
+    feed, densest = (drawn[f"bed.{name}_solid_fraction"] for name in ("feed", "max"))
     steepest = math.acos(max(1 - (entry_gap - gap) / diameter, 0.5))
     angle = min(max(steepest * generator.random(), 1e-3), 1.0)
-    cake = feed * math.cos(angle) * (gap + diameter * (1 - math.cos(angle))) / gap  # as hpgr.flow.nip_angle has it
-    if generator.random() < 0.5 and feed <= cake <= densest:
-        return {"flow.cake_solid_fraction": cake}
-    return {"flow.nip_angle": angle}
-
-
-def _draw_number(known: Range, generator: np.random.Generator) -> float:
-    """Return a value within the range, at one of its ends once in ten."""
-    if generator.random() < 0.1:
-        ends = known.ends()
-        return ends[generator.integers(len(ends))]
-    return known.at(generator.random())
+    cake = feed * math.cos(angle) * (gap + diameter * (1 - math.cos(angle))) / gap  # continuity, as NipFlow has it
+    by_cake = generator.random() < 0.5 and feed <= cake <= densest
+    return {"flow.nip_angle": None if by_cake else angle, "flow.cake_solid_fraction": cake if by_cake else None}
 
 
 def _log_uniform(low: float, high: float, generator: np.random.Generator) -> float:
@@ -223,32 +222,34 @@ def _draw_gaps(diameter: float, generator: np.random.Generator) -> dict[str, Any
 
 def _draw_feed(entry_gap: float, generator: np.random.Generator) -> dict[str, Any]:
     """Return a feed of any kind that is no coarser than the entry gap."""
-    fields = parts()["feed"].model_fields
-    kind = choices()["feed.kind"][generator.integers(len(choices()["feed.kind"]))]
-    known = {name: ranged for name, ranged in numeric_fields().items() if name.startswith("feed.")}
-    top = min(max(_log_uniform(1e-3 * entry_gap, entry_gap, generator), 1e-6), 10.0)
-    size = _log_uniform(1e-6, max(top, 1e-6), generator)
-    exponent = _draw_number(known["feed.exponent"], generator)
+    kinds, known = choices()["feed.kind"], numeric_fields()
+    kind = kinds[generator.integers(len(kinds))]
+    top = min(
+        max(_log_uniform(1e-3 * entry_gap, entry_gap, generator), known["feed.top_size"].low),
+        known["feed.top_size"].high,
+    )
+    size = _log_uniform(known["feed.size"].low, top, generator)
+    exponent = known["feed.exponent"].draw(generator)
     percents = np.sort(generator.uniform(0, 100, 4)) * [0.1 * generator.integers(2), 1, 1, 1]
-    table = list(zip(top * np.array([0.01, 0.1, 0.3, 0.6]), percents, strict=True))
+    rows = zip(top * np.array([0.01, 0.1, 0.3, 0.6, 1.0]), [*percents, 100.0], strict=True)
     values = {
         "uniform": {"bottom_size": top * generator.random(), "top_size": top},
         "single": {"size": top},
         "power_law": {"top_size": top, "exponent": exponent},
         "rosin_rammler": {"size": size, "exponent": exponent, "top_size": top},
-        "table": {"table": [*((float(s), float(f)) for s, f in table), (top, 100.0)]},
+        "table": {"table": [(float(s), float(f)) for s, f in rows], "top_size": None},
     }[kind]
-    return {f"feed.{name}": values.get(name) for name in fields} | {"feed.kind": kind}
+    return {"feed.kind": kind} | {f"feed.{name}": value for name, value in values.items()}
 
 
-def _draw_resolution(exchange: bool, generator: np.random.Generator) -> dict[str, Any]:
-    records = choices()["resolution.record"]
+def _draw_resolution(exchange: bool, width: bool, generator: np.random.Generator) -> dict[str, Any]:
+    records = ("product",) if width else choices()["resolution.record"]
     few = generator.integers(0, 4)
     return {
         "resolution.streamlines": int(generator.integers(1, 5 if exchange else 7)),
         "resolution.points": int(generator.integers(2, 41 if exchange else 101)),
         "resolution.cells": int(few if generator.random() < 0.3 else generator.integers(4, 65 if exchange else 201)),
-        "resolution.photographs": int(generator.integers(1, 4)),
+        "resolution.snapshots": int(generator.integers(1, 4)),
         "resolution.record": records[generator.integers(len(records))],
     } | ({"exchange.interval": int(generator.integers(1, 6))} if exchange else {})
 
@@ -260,9 +261,9 @@ def _affordable(base: Scene, values: dict[str, Any], most_seconds: float) -> dic
             scene = base.with_values(values)
         except ValidationError:
             return values  # it will not be run
-        if budget.predict(scene).seconds <= most_seconds or scene.resolution.points <= 2:
+        if cost.predict(scene).seconds <= most_seconds or scene.resolution.points <= 2:
             return values
-        name, count = "stress.substeps", scene.stress.substeps
+        name, count = "elasticity.substeps", scene.elasticity.substeps
         if count == 1:
             name, count = "resolution.points", scene.resolution.points
         values = values | {name: count // 2}

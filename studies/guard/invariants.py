@@ -10,8 +10,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import xarray as xr
 
-from hpgr import feed, kernels, metrics, parcels, schema, stress
-from hpgr.exchange import MOST_PASSES
+from hpgr.grains import kernels, solve
+from hpgr.laws.exchange import MOST_SUBSTEPS
+from hpgr.results import flags, metrics
 from hpgr.scene import Scene
 
 _ROUNDING = 2.0**-22  # relative; a float32 is good to 2**-24, a quotient or mean of some to a few of that
@@ -25,7 +26,7 @@ def violations(dataset: xr.Dataset) -> list[str]:
     Examples
     --------
     >>> import hpgr
-    >>> from studies.invariants import violations
+    >>> from studies.guard.invariants import violations
     >>> violations(hpgr.simulate(hpgr.presets.paper().with_values({"resolution.cells": 50})))
     []
     """
@@ -58,7 +59,7 @@ def _complete(scene: Scene, result: Result) -> Iterator[str]:
         wanted |= {"passing", "passing_total", "p50", "p80", "p50_total", "p80_total", "breaks_per_cell", "below_floor"}
         wanted |= {"cells": {"size"}, "distributions": {"mass_fraction"}, "product": set()}[scene.resolution.record]
     if result.attrs["solver"] == "lattice":
-        wanted |= {"volume", "swaps_per_cell", "exchange_passes"}
+        wanted |= {"volume", "swaps_per_cell", "exchange_substeps"}
     missing = sorted(wanted - set(result))
     if missing:
         yield f"missing {', '.join(missing)}"
@@ -95,15 +96,15 @@ def _tension(scene: Scene, result: Result) -> Iterator[str]:
         ((found[:, 1:] == 0) & (found[:, :-1] > _TINY) & (volumetric[:, 1:] > 0)).any()
         for found in (pressure, shear_stress)
     )
-    ore = scene.material
-    c, eta = ore.elastic_exponent, np.divide(shear, volumetric, out=np.zeros_like(shear), where=volumetric > _TINY)
-    pulled = ore.bulk_modulus / (c + 1) + 1.5 * ore.shear_modulus * c * eta**2 < -1e-3 * ore.bulk_modulus
-    if (dropped or pulled.any()) and "tension_clamped" not in flags_of(result):
+    law = scene.elasticity
+    c, eta = law.exponent, np.divide(shear, volumetric, out=np.zeros_like(shear), where=volumetric > _TINY)
+    pulled = law.bulk_modulus / (c + 1) + 1.5 * law.shear_modulus * c * eta**2 < -1e-3 * law.bulk_modulus
+    if (dropped or pulled.any()) and "tension_clamped" not in flags.names(int(result["flags"])):
         yield f"tension_clamped is missing: {'a stress falls to 0' if dropped else 'the state law is negative'}"
 
 
 def _shear_ratio(scene: Scene, result: Result) -> Iterator[str]:
-    limit = stress.largest_shear_ratio(scene.material)
+    limit = scene.elasticity.largest_shear_ratio()
     volumetric, shear = (result[name].astype(float) for name in ("volumetric_strain", "shear_strain"))
     slack = 2.0**-149 * (1 + limit)  # spacing of the smallest float32
     if math.isfinite(limit) and not (shear <= limit * volumetric * (1 + _ROUNDING) + slack).all():
@@ -112,11 +113,11 @@ def _shear_ratio(scene: Scene, result: Result) -> Iterator[str]:
 
 
 def _solid_fraction(scene: Scene, result: Result) -> Iterator[str]:
-    ore, found = scene.material, result["solid_fraction"]
-    if not (found <= np.float32(ore.max_solid_fraction)).all():
-        yield f"solid_fraction reaches {found.max():g}, its limit is {ore.max_solid_fraction:g}"
-    if not (found >= np.float32(ore.feed_solid_fraction)).all():
-        yield f"solid_fraction falls to {found.min():g}, below the feed's {ore.feed_solid_fraction:g}"
+    bed, found = scene.bed, result["solid_fraction"]
+    if not (found <= np.float32(bed.max_solid_fraction)).all():
+        yield f"solid_fraction reaches {found.max():g}, its limit is {bed.max_solid_fraction:g}"
+    if not (found >= np.float32(bed.feed_solid_fraction)).all():
+        yield f"solid_fraction falls to {found.min():g}, below the feed's {bed.feed_solid_fraction:g}"
 
 
 def _throughput(scene: Scene, result: Result) -> Iterator[str]:
@@ -144,7 +145,7 @@ def _never_coarser(scene: Scene, result: Result) -> Iterator[str]:
     """
     if not scene.resolution.cells:
         return
-    top = np.float32(scene.feed.coarsest)
+    top = np.float32(scene.feed.largest_grain)
     for name in ("size", "p50", "p80", "p50_total", "p80_total"):
         if name in result and not result[name].max() <= top:
             yield f"{name} reaches {result[name].max():g} m, the feed's top size is {top:g} m"
@@ -156,7 +157,7 @@ def _never_coarser(scene: Scene, result: Result) -> Iterator[str]:
 def _distributions(scene: Scene, result: Result) -> Iterator[str]:
     if not scene.resolution.cells:
         return
-    coarsest_passes = np.float32(scene.resolution.sieves[-1]) >= np.float32(scene.feed.coarsest)
+    largest_passes = np.float32(scene.resolution.sieves[-1]) >= np.float32(scene.feed.largest_grain)
     found = {name: result[name] for name in ("passing", "passing_total")}
     if "mass_fraction" in result:
         if not result["mass_fraction"].min() >= 0:
@@ -167,7 +168,7 @@ def _distributions(scene: Scene, result: Result) -> Iterator[str]:
             yield f"{name} falls with sieve size"
         if not (passing.min() >= 0 and passing.max() <= 1 + _ROUNDING):
             yield f"{name} leaves 0 to 1: {passing.min():g} to {passing.max():g}"
-        if coarsest_passes and not (passing[..., -1] >= 1 - _ROUNDING).all():
+        if largest_passes and not (passing[..., -1] >= 1 - _ROUNDING).all():
             yield f"{name} ends at {passing[..., -1].min():g}, though the coarsest sieve passes every grain"
     for end in ("", "_total"):
         p50, p80 = result[f"p50{end}"], result[f"p80{end}"]
@@ -193,10 +194,10 @@ def _counts(scene: Scene, result: Result) -> Iterator[str]:
         steps = (result["volumetric_strain_rate"] > 0).sum(axis=1)
         if not (breaks <= steps).all():
             yield f"breaks_per_cell is {breaks.max():g}: more than one in a time step"
-    if "exchange_passes" in result:
-        passes, swaps = int(result["exchange_passes"]), float(result["swaps_per_cell"])
-        if not (1 <= passes <= MOST_PASSES and swaps >= 0):
-            yield f"exchange_passes is {passes}, swaps_per_cell {swaps:g}"
+    if "exchange_substeps" in result:
+        substeps, swaps = int(result["exchange_substeps"]), float(result["swaps_per_cell"])
+        if not (1 <= substeps <= MOST_SUBSTEPS and swaps >= 0):
+            yield f"exchange_substeps is {substeps}, swaps_per_cell {swaps:g}"
         if not result["volume"].min() > 0:
             yield f"a volume is {result['volume'].min():g}"
 
@@ -219,7 +220,7 @@ def _unbroken(scene: Scene, result: Result) -> Iterator[str]:
 def _swaps_conserve(scene: Scene, result: Result) -> Iterator[str]:
     """From one time step to the next all cells but those that left are still there, bit for bit.
 
-    Judged where every step is photographed and nothing can break.
+    Judged where every step is recorded and nothing can break.
     """
     if "size" not in result or "elapsed_time" not in result or not nothing_can_break(scene, result):
         return
@@ -232,14 +233,14 @@ def _swaps_conserve(scene: Scene, result: Result) -> Iterator[str]:
         place = np.minimum(np.searchsorted(known, stayed), known.size - 1)
         lost = np.where(known[place] == stayed, np.maximum(count - found[place], 0), count).sum()
         if lost:
-            yield f"{lost} cells of photograph {step} are gone from the next"
+            yield f"{lost} cells of snapshot {step} are gone from the next"
 
 
 def _flags(scene: Scene, result: Result) -> Iterator[str]:
     """Every flag is there that must be, and none that must not."""
-    found, cells = flags_of(result), scene.resolution.cells
-    needed = float(result["continuity_solid_fraction"].max()) / scene.material.max_solid_fraction
-    nipped = scene.feed.coarsest / (_NIPPING * scene.rolls.gap)
+    found, cells = flags.names(int(result["flags"])), scene.resolution.cells
+    needed = float(result["continuity_solid_fraction"].max()) / scene.bed.max_solid_fraction
+    nipped = scene.feed.largest_grain / (_NIPPING * scene.rolls.gap)
     wanted = {
         "solid_fraction_capped": None if abs(needed - 1) <= _ROUNDING else needed > 1,
         "single_particle_nipping": nipped > 1,
@@ -251,9 +252,9 @@ def _flags(scene: Scene, result: Result) -> Iterator[str]:
     for name, must in wanted.items():
         if must is not None and must != (name in found):
             yield f"{name} is {'missing' if must else 'set without its reason'}"
-    noted = [line.partition(":")[0] for line in result.attrs["notes"].splitlines()]
+    noted = [line.partition(":")[0] for line in result.attrs["diagnostics"].splitlines()]
     if sorted(noted) != sorted(found):
-        yield f"flags say {', '.join(found) or 'none'}, notes say {', '.join(noted) or 'none'}"
+        yield f"flags say {', '.join(found) or 'none'}, diagnostics say {', '.join(noted) or 'none'}"
 
 
 INVARIANTS: dict[str, Callable[[Scene, Result], Iterator[str]]] = {
@@ -275,11 +276,6 @@ INVARIANTS: dict[str, Callable[[Scene, Result], Iterator[str]]] = {
 }
 
 
-def flags_of(result: Result | xr.Dataset) -> list[str]:
-    """Return the names of the limits that a result says it hit."""
-    return [name for name, mask in schema.FLAGS.items() if int(result["flags"]) & mask]
-
-
 def _reaches_floor(scene: Scene, result: Result) -> bool | None:
     """Return whether some of the product is below the floor; None where as little as a float32 cannot hold may be."""
     if scene.resolution.cells and result["below_floor"].any():
@@ -294,21 +290,21 @@ def nothing_can_break(scene: Scene, result: Result) -> bool:
     1e-4 of the limit, where rounding could decide.
     """
     stresses = result["pressure"].astype(float)
-    if scene.stress.crushing == "major":
+    if scene.strength.stress == "major":
         stresses = stresses + 2 / 3 * result["shear_stress"]
     largest = stresses[result["volumetric_strain_rate"] > 0].max(initial=0.0)
     if largest == 0:
         return not result["pressure"].any()
-    ore = scene.material
-    weakest = -(3 / ore.weibull_modulus) * math.log(scene.feed.coarsest / ore.strength_size)
-    return math.log(largest / ore.strength) < weakest - 1e-4
+    ore = scene.strength
+    weakest = -(3 / ore.weibull_modulus) * math.log(scene.feed.largest_grain / ore.reference_size)
+    return math.log(largest / ore.reference_strength) < weakest - 1e-4
 
 
 def feed_cells(scene: Scene, result: Result) -> np.ndarray:
-    """Return the cells (photograph, streamline, cell) that entered and are now the product, without exchange."""
+    """Return the cells (snapshot, streamline, cell) that entered and are now the product, without exchange."""
     grid = scene.resolution
-    shape = (grid.photographs, grid.streamlines)
-    keys = [(int(result.attrs["replicate"]), line, photograph) for photograph, line in np.ndindex(shape)]
+    shape = (grid.snapshots, grid.streamlines)
+    keys = [(int(result.attrs["replicate"]), line, snapshot) for snapshot, line in np.ndindex(shape)]
     return parcels.first_cells(scene, int(result.attrs["seed"]), keys)[0].reshape(*shape, grid.cells)
 
 
@@ -316,7 +312,7 @@ def _feed_passing(scene: Scene, result: Result) -> np.ndarray | None:
     """Return the fraction (streamline, sieve) that the feed of each streamline passes; None with exchange."""
     solver = result.attrs["solver"]
     if solver == "closed form":
-        law = feed.passing(scene.feed, np.array(scene.resolution.sieves)).astype(np.float32)
+        law = scene.feed.passing(scene.resolution.sieves).astype(np.float32)
         return np.broadcast_to(law, result["passing"].shape)
     if solver != "march":
         return None

@@ -1,0 +1,65 @@
+"""What refinement tells of an error: order, limit and index of three grids, exponent of noise, Pareto front."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+SAFETY = 1.25  # of the grid convergence index; the customary factor for three grids
+ORDERS = (0.5, 2.0)  # an observed order is held within these before anything is extrapolated with it
+ROUNDING = 1e-12  # relative differences below it are none
+
+
+def observed_order(coarse, medium, fine) -> np.ndarray:
+    """Return the order of convergence seen on three grids, each twice as fine as the one before.
+
+    NaN where nothing changes, or where the two changes differ in sign: there is no order to see.
+    """
+    first, second = np.asarray(medium - coarse, float), np.asarray(fine - medium, float)
+    known = (first * second > 0) & (np.abs(second) > ROUNDING * np.abs(fine))
+    ratio = np.divide(first, second, out=np.ones_like(second), where=known)
+    return np.where(known, np.log2(ratio), np.nan)
+
+
+def richardson(coarse, medium, fine) -> np.ndarray:
+    """Return the limit of three grids, fine + (fine - medium) / (2^p - 1).
+
+    p is the observed order held within `ORDERS`, the lowest of them if there is none.
+    """
+    order = np.clip(np.nan_to_num(observed_order(coarse, medium, fine), nan=ORDERS[0]), *ORDERS)
+    return fine + (fine - medium) / (2**order - 1)
+
+
+def convergence_index(coarse, medium, fine) -> np.ndarray:
+    """Return the grid convergence index of the finest of three grids in its own unit, SAFETY |limit - fine|."""
+    return SAFETY * np.abs(richardson(coarse, medium, fine) - fine)
+
+
+def noise_exponent(sizes, noise, replicates: int) -> tuple[float, float]:
+    """Return the exponent of noise against `sizes`, and its standard error; NaN if there is no noise.
+
+    A standard deviation of R replicates is known to 1 / sqrt(2 (R - 1)) of itself.
+    """
+    sizes, noise = np.log(np.asarray(sizes, float)), np.asarray(noise, float)
+    if not (noise > ROUNDING).all():
+        return np.nan, np.nan
+    away = sizes - sizes.mean()
+    slope = float(away @ np.log(noise) / (away @ away))
+    return slope, float(1 / np.sqrt(2 * (replicates - 1) * (away @ away)))
+
+
+def pareto(cost, error) -> np.ndarray:
+    """Return where nothing else is at most as costly and at most as wrong; of equals the first."""
+    cost, error = np.asarray(cost, float), np.asarray(error, float)
+    front, least = np.zeros(cost.size, bool), np.inf
+    for k in np.lexsort((error, cost)):
+        front[k] = error[k] < least
+        least = min(least, error[k])
+    return front
+
+
+def jackknife(statistic: Callable[[np.ndarray], np.ndarray], samples: np.ndarray) -> np.ndarray:
+    """Return the standard error of `statistic` of means, from samples (rung, replicate, quantity)."""
+    count = samples.shape[1]
+    left_out = (samples.sum(axis=1, keepdims=True) - samples) / (count - 1)  # means, each without one replicate
+    found = np.stack([statistic(left_out[:, k]) for k in range(count)])
+    return np.sqrt((count - 1) / count * ((found - found.mean(axis=0)) ** 2).sum(axis=0))

@@ -1,0 +1,214 @@
+"""How a scene ends: well, flagged, in substeps or refused; anything else is a silent fault."""
+
+import math
+import re
+import warnings
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from pydantic import ValidationError
+
+from hpgr import cost, presets
+from hpgr.fields import kinds_of
+from hpgr.scene import Scene
+from studies.guard import ranges
+
+KINDS = ("ok", "flagged", "substepped", "refused", "fault")
+ROOM = 256_000_000  # bytes that a scene of this study may take: what is refused must not depend on the machine
+_STILL = {  # no stress reaches any strength, and every time step is a snapshot: what swaps conserve shows
+    "strength.reference_strength": 1e15,
+    "strength.weibull_modulus": math.inf,
+    "elasticity.bulk_modulus": 1.0,
+    "elasticity.shear_modulus": 1.0,
+    "elasticity.exponent": 1.0,
+    "exchange.interval": 1,
+    "resolution.snapshots": 3,
+    "resolution.record": "cells",
+}
+SAMPLES: dict[str, dict[str, dict[str, Any]]] = {  # of laws that have fields without a default
+    "feed": {
+        "uniform": {"bottom_size": 0.008, "top_size": 0.06},
+        "single": {"size": 0.06},
+        "power_law": {"top_size": 0.06, "exponent": 0.7},
+        "rosin_rammler": {"size": 0.03, "exponent": 1.3, "top_size": 0.06},
+        "table": {"table": ((0.004, 0.0), (0.016, 40.0), (0.06, 100.0)), "top_size": None},
+    },
+    "flow": {"nip": {"nip_angle": 0.15}},
+}
+
+
+class Outcome(NamedTuple):
+    """How a scene ended: one of `KINDS`, its flags and exchange substeps, and what there is to say."""
+
+    kind: str
+    flags: int = 0
+    substeps: int = 0
+    message: str = ""
+
+
+class Row(NamedTuple):
+    """One extreme of docs/model.md: its words, the values, the kind of outcome wanted, and words it must hold."""
+
+    name: str
+    values: dict[str, Any]
+    wanted: str
+    says: tuple[str, ...] = ()
+
+
+def base(values: Mapping[str, Any] | None = None) -> Scene:
+    """Return the scene that is walked from: the paper's rolls with a shallow bed, in which no limit is hit."""
+    small = {"resolution.streamlines": 2, "resolution.points": 41, "resolution.cells": 32}
+    return presets.paper().with_values({"rolls.entry_gap": 0.5} | small | dict(values or {}))
+
+
+def judge(values: Mapping[str, Any], seed: int = 0) -> Outcome:
+    """Return how the base scene with other values ends; whatever must not happen is a "fault".
+
+    A fault is an exception or warning that is no refusal, a refusal that does not say field, value, bound and
+    remedy, or a result that violates an invariant.
+    """
+    try:
+        scene = base(values)
+    except ValidationError as error:
+        return _refusal([(".".join(map(str, fault["loc"])), fault["msg"]) for fault in error.errors()])
+    except Exception as error:
+        return Outcome("fault", message=_crash(error))
+    outcome = _run(scene, seed)
+    if outcome.substeps and outcome.kind != "fault":
+        still = _run(scene.with_values(_STILL), seed)  # the same machine, with nothing to break
+        if still.kind == "fault":
+            return still._replace(message=f"with nothing to break: {still.message}")
+    return outcome
+
+
+def _run(scene: Scene, seed: int) -> Outcome:
+    import hpgr
+    from hpgr.results import flags
+    from studies.guard import invariants
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            # without the compiler NumPy speaks up when a 64-bit stream wraps, which is what it is there for
+            warnings.filterwarnings("ignore", "overflow encountered in scalar", RuntimeWarning, r"hpgr\.grains")
+            cost.refuse_too_large(scene, (ROOM, "this study's own limit"))
+            result = hpgr.simulate(scene, seed)
+    except ValidationError as error:
+        return Outcome("fault", message=_crash(error))
+    except (ValueError, MemoryError) as error:
+        field, _, message = str(error).partition(": ")
+        return _refusal([(field, message)])
+    except Exception as error:
+        return Outcome("fault", message=_crash(error))
+    bits, substeps = int(result["flags"]), int(result.get("exchange_substeps", 0))
+    violated = invariants.violations(result)
+    if violated:
+        return Outcome("fault", bits, substeps, "; ".join(violated))
+    limits = bits & ~flags.BITS["unusual_machine"]  # how a machine is usually run is no limit of the model
+    kind = "substepped" if substeps > 1 else "flagged" if limits else "ok"
+    return Outcome(kind, bits, substeps, ", ".join(flags.names(bits)))
+
+
+def _crash(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+_FORM = re.compile(r"got .+?[;:,] .*(must|needs it|does nothing|is required|too close|reaches 0 %).*; .+")
+
+
+def _refusal(told: list[tuple[str, str]]) -> Outcome:
+    """Return the refusal if every message has its form: field, got value; bound; remedy."""
+    for field, message in told:
+        if field.partition(".")[0] not in Scene.model_fields or not _FORM.fullmatch(message):
+            return Outcome("fault", message=f"a refusal without field, value, bound or remedy: {field}: {message}")
+    return Outcome("refused", message="; ".join(f"{field}: {message}" for field, message in told))
+
+
+def hosts(values: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the values set in every law that has their fields; none if no law has them all."""
+    found = [dict(values)]
+    for section in {name.partition(".")[0] for name in values if "." in name}:
+        keys = {name.partition(".")[2] for name in values if name.startswith(f"{section}.")}
+        laws = [law for law in ranges.laws()[section] if keys <= law.model_fields.keys()]
+        wanted = values.get(f"{section}.kind")
+        kinds = [kind for law in laws for kind in kinds_of(law) if wanted in (None, kind)]
+        if len(ranges.laws()[section]) > 1:
+            found = [_sample(section, kind, keys) | one for kind in kinds for one in found]
+    if any(name.startswith("roll_width.") for name in values):
+        found = [{"resolution.record": "product"} | one for one in found]
+    return found
+
+
+def _sample(section: str, kind: str, keys: set[str]) -> dict[str, Any]:
+    """Return a kind of law with the fields that it cannot do without."""
+    sample = SAMPLES.get(section, {}).get(kind, {})
+    if "cake_solid_fraction" in keys:  # in place of the nip angle
+        sample = {}
+    return {f"{section}.kind": kind} | {f"{section}.{name}": value for name, value in sample.items()}
+
+
+def as_wanted(row: Row, found: Outcome) -> Outcome:
+    """Return the outcome of a row of the catalogue, a fault if it is not the wanted one."""
+    if found.kind == row.wanted and all(words in found.message for words in row.says):
+        return found
+    says = f" saying {', '.join(row.says)}" if row.says else ""
+    return found._replace(kind="fault", message=f"wanted {row.wanted}{says}, found {found.kind}: {found.message}")
+
+
+def catalogue() -> list[Row]:
+    """Return the extremes of docs/model.md, each with the outcome it must have."""
+    inf, nan = math.inf, math.nan
+    absurd = {"resolution.points": 3, "resolution.streamlines": 40, "exchange": {"mixing": 100}}
+    refused = [
+        ("gap of 0", {"rolls.gap": 0}, "rolls.gap: got 0 mm"),
+        ("negative gap", {"rolls.gap": "-5 mm"}, "rolls.gap: got -5 mm"),
+        ("gap above the entry gap", {"rolls.gap": 0.501}, "must be at most the entry gap 500 mm"),
+        ("rise of the entry above the diameter", {"rolls.entry_gap": 6.07}, "entry angle of 60 degrees"),
+        ("NaN", {"rolls.gap": nan}, "must not be NaN"),
+        ("infinite gap", {"rolls.gap": inf}, "must be finite"),
+        ("speed of 0", {"rolls.speed": 0}, "rolls.speed: got 0 rpm"),
+        ("density of 0", {"bed.solid_density": 0}, "solid_density: got 0 kg m-3"),
+        ("w of 0", {"strength.weibull_modulus": 0}, "weibull_modulus: got 0"),
+        ("n below 1e-6", {"strength.cushioning": 9e-7}, "cushioning: got 9e-07"),
+        ("c of -1", {"elasticity.exponent": -1}, "elasticity.exponent: got -1"),
+        ("feed above the entry gap", {"feed.top_size": 0.51}, "entry gap rolls.entry_gap 500 mm"),
+        ("swaps beyond all substeps", absurd, "predicted cost"),
+        ("coinciding points", {"flow.entry_fraction": 1e-9, "resolution.points": 2001}, "of the bed's height apart"),
+        ("more cells than memory", {"resolution.cells": 10_000_000}, "bytes"),
+    ]
+    every = {"rolls.gap": nan, "rolls.speed": 0, "strength.weibull_modulus": -1, "feed.top_size": 0.6}
+    flat, both = ("no_compaction", "no_breakage"), {"strength.weibull_modulus": inf, "strength.cushioning": inf}
+    hundreds = {"strength.weibull_modulus": inf, "strength.reference_strength": 1.0, "resolution.points": 801}
+    floor, tension = ("size_floor_reached",), ("tension_clamped",)
+    flagged = [
+        ("gap = entry gap", {"rolls.gap": 0.5}, flat),
+        ("gap = entry gap, with exchange", {"rolls.gap": 0.5, "exchange": {}}, flat),
+        ("top size of 1.6 gaps", {"feed.top_size": 0.096}, ("single_particle_nipping",)),
+        ("strength above every stress", {"strength.reference_strength": 1e15}, ("no_breakage",)),
+        ("exit solid fraction above its limit", {"rolls.entry_gap": 1.14}, ("solid_fraction_capped",)),
+        ("M = 2", {"resolution.cells": 2}, ("few_cells",)),
+        ("M = 3", {"resolution.cells": 3}, ("few_cells",)),
+        ("n = inf, closed form", {"strength.cushioning": inf, "resolution.record": "product"}, floor),
+        ("gamma of 0.001", {"fragments.exponent": 1e-3}, floor),
+        ("hundreds of breaks", hundreds, floor),
+        ("c below 0", {"elasticity.exponent": -0.5}, tension),
+        ("c below 0, Euler", {"elasticity.exponent": -0.5, "elasticity.integrator": "euler"}, tension),
+    ]
+    well = {
+        "top size of 1.4 gaps": {"feed.top_size": 0.084},
+        "swap sum below 1/2": {"exchange": {"segregation": 1e-3, "mixing": 1e-3}},
+        "M = 0": {"resolution.cells": 0},
+        "M = 1": {"resolution.cells": 1},
+        "w = inf": {"strength.weibull_modulus": inf},
+        "n = inf": {"strength.cushioning": inf},
+        "w = inf and n = inf": both,
+        "gamma of 1e6": {"fragments.exponent": 1e6},
+        "c = 0": {"elasticity.exponent": 0},
+    }
+    return [
+        *(Row(name, values, "refused", (says,)) for name, values, says in refused),
+        Row("all faults at once", every, "refused", tuple(every)),
+        *(Row(name, values, "flagged", says) for name, values, says in flagged),
+        *(Row(name, values, "ok") for name, values in well.items()),
+        Row("swap sum above 1/2", {"exchange": {}}, "substepped"),
+    ]

@@ -1,0 +1,1 @@
+"""What a study shows: tables in the terminal, figures, the explorer page."""

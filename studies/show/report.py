@@ -1,0 +1,228 @@
+"""What a study says in the terminal: tables, the limits that were hit, and the cases that were lost."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import xarray as xr
+
+from hpgr.fields import show, unit_shown
+from hpgr.results import flags, metrics
+from hpgr.results.schema import ERRORS, STATUS
+from studies.sweep.netcdf import scene_of
+
+PRODUCT = {  # variable -> heading, how many of its unit make one SI unit
+    "throughput": ("throughput [t/h]", 3.6),
+    "p50_total": ("P50 [mm]", 1e3),
+    "p80_total": ("P80 [mm]", 1e3),
+    "passing_total": ("below {} [%]", 100.0),
+    "peak_pressure": ("peak pressure [MPa]", 1e-6),
+}
+MACHINE = {
+    "operating_gap": ("gap [mm]", 1e3),
+    "specific_pressing_force": ("Fsp [N/mm²]", 1e-6),
+    "pressing_force": ("force [kN]", 1e-3),
+    "torque": ("torque [kN m]", 1e-3),
+    "power": ("power [kW]", 1e-3),
+    "specific_energy": ("W [kWh/t]", 1 / 3600),
+    "specific_throughput": ("mdot [t s/(h m³)]", 3.6),
+    "nip_angle": ("nip [deg]", 180 / np.pi),
+    "force_angle": ("beta [deg]", 180 / np.pi),
+}
+
+
+def aligned(headings: Sequence[str], rows: Iterable[Sequence[str]], markdown: bool = False, words: int = 0) -> str:
+    """Return rows of text as a table with aligned columns, or as markdown; the first `words` columns are flush left.
+
+    Examples
+    --------
+    >>> from studies.show.report import aligned
+    >>> print(aligned(["gap [mm]", "P80 [mm]"], [["60", "1.7"]]))
+    gap [mm]  P80 [mm]
+          60       1.7
+    """
+    rows = [list(headings), *map(list, rows)]
+    if markdown:
+        rows.insert(1, ["---" if k < max(words, 1) else "---:" for k in range(len(headings))])
+        return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = (
+        "  ".join(
+            text.ljust(width) if k < words else text.rjust(width)
+            for k, (text, width) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in rows
+    )
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def axes_of(result: xr.Dataset) -> list[str]:
+    """Return the swept dims of a study result, in order."""
+    return [name for name, value in result.coords.items() if value.dims and "scene_field" in value.attrs]
+
+
+def operating_points(result: xr.Dataset) -> xr.Dataset:
+    """Return the result with its swept dims stacked into one dimension `operating_point`."""
+    axes = axes_of(result)
+    if not axes:
+        return result.expand_dims("operating_point")
+    return result.stack(operating_point=axes, create_index=False)
+
+
+def percent_passing(result: xr.Dataset, sieve: float, total: bool = True) -> xr.DataArray:
+    """Return the percent of the product passing `sieve` (m), linear in log size between recorded sieves."""
+    fractions = result["passing_total" if total else "passing"].astype(float)
+    found = 100 * metrics.between_sieves(fractions, np.array([sieve])).isel(sieve=0, drop=True)
+    found.attrs = {"units": "percent", "long_name": f"product below {show(sieve, 'm')}"}
+    return found
+
+
+def figures(result: xr.Dataset, sieve: float) -> dict[str, xr.DataArray]:
+    """Return the figures a study is read by, by heading, in the units people use."""
+    found = {}
+    for name, (heading, factor) in PRODUCT.items():
+        if name == "passing_total" and name in result:
+            found[heading.format(show(sieve, "m"))] = percent_passing(result, sieve)
+        elif name in result:
+            found[heading] = result[name].astype(float) * factor
+    return found
+
+
+def machine_figures(result: xr.Dataset) -> dict[str, xr.DataArray]:
+    """Return force, power and their like, by heading, in the units people use."""
+    return {
+        heading: result[name].astype(float) * factor for name, (heading, factor) in MACHINE.items() if name in result
+    }
+
+
+def spread(values: xr.DataArray) -> xr.DataArray:
+    """Return the sample standard deviation over replicates; NaN where there is only one."""
+    if values.sizes["replicate"] < 2:
+        return values.isel(replicate=0) * np.nan
+    deviation = values.std("replicate", ddof=1)
+    return deviation.where(values.max("replicate") > values.min("replicate"), deviation * 0)  # not its rounding
+
+
+def table(result: xr.Dataset, sieve: float) -> str:
+    """Return one line per operating point: axes, then mean ± standard deviation over the replicates."""
+    if not any_result(result):
+        return "no case holds a result"
+    points = operating_points(result)
+    parts = [
+        _points_table(result, points, found) for found in (figures(points, sieve), machine_figures(points)) if found
+    ]
+    if result.sizes["replicate"] > 1:
+        parts[-1] += f"\n(mean ± standard deviation of {result.sizes['replicate']} replicates)"
+    return "\n\n".join(parts)
+
+
+def _points_table(result: xr.Dataset, points: xr.Dataset, found: dict[str, xr.DataArray]) -> str:
+    columns = {axis_label(points[name]): _axis_texts(points[name]) for name in axes_of(result)}
+    for heading, values in found.items():
+        means, spreads = values.mean("replicate").values, spread(values).values
+        columns[heading] = [_mean_and_spread(*each) for each in zip(means, spreads, strict=True)]
+    return aligned(list(columns), zip(*columns.values(), strict=True))
+
+
+def _mean_and_spread(mean: float, deviation: float) -> str:
+    if np.isnan(mean):
+        return "-"
+    return f"{mean:.4g}" + ("" if np.isnan(deviation) else f" ± {deviation:.2g}")
+
+
+def remarks(result: xr.Dataset) -> list[str]:
+    """Return a line for the scene's own remark, for estimated errors, and for each limit that was hit."""
+    own = scene_of(result).remark
+    lines = [f"remark: {own}"] if own else []
+    worst = {name: 100 * float(result[error].max()) for name, error in ERRORS.items() if error in result}
+    if worst:
+        told = ", ".join(f"{name.replace('_', ' ')} {error:.2g} %" for name, error in worst.items())
+        lines.append(f"estimated errors of a run (bias + 2 standard errors), at most: {told}")
+    if result.attrs.get("left_out"):
+        lines.append(f"left out, being of another shape from case to case: {result.attrs['left_out']}")
+    if "exchange_substeps" in result:
+        swaps, most = float(result["swaps_per_cell"].mean()), int(result["exchange_substeps"].max())
+        lines.append(
+            f"exchange: {swaps:.3g} swaps of a cell in one residence time; at most {most} substeps a time step"
+        )
+    return lines + flagged(result)
+
+
+def flagged(result: xr.Dataset) -> list[str]:
+    """Return a line for each limit that operating points have hit, with the words of the first that did."""
+    if "flags" not in result:
+        return []
+    points, lines = operating_points(result), []
+    for name, mask in flags.BITS.items():
+        hit = (points["flags"] & mask) > 0
+        if hit.any():
+            texts = points["diagnostics"].transpose(*hit.dims).values[hit.values]
+            told = next(line for line in str(texts[0]).splitlines() if line.startswith(name)).partition(": ")[2]
+            count, total = int(hit.any("replicate").sum()), points.sizes["operating_point"]
+            lines.append(f"flag {name} at {count} of {total} operating points; the first: {told}")
+    return lines
+
+
+def change(result: xr.Dataset, field: str) -> list[str]:
+    """Return a line on how much P80 changes from end to end of the axis of a scene field, if it can be told.
+
+    Replicates share their random numbers along an axis, so the change is that of pairs; other axes are averaged.
+    """
+    axis = next(result[name] for name in axes_of(result) if result[name].attrs["scene_field"] == field)
+    if "p80_total" not in result or axis.size < 2 or axis.dtype.kind not in "fiu":
+        return []
+    order = np.argsort(axis.values)
+    p80 = result["p80_total"].astype(float).isel({axis.name: order})
+    ratio = 100 * (p80.isel({axis.name: -1}) / p80.isel({axis.name: 0}) - 1)
+    ratio = ratio.mean([name for name in ratio.dims if name != "replicate"])
+    count = int(ratio.notnull().sum())
+    if not count:
+        return []
+    error = f" ± {float(ratio.std(ddof=1)) / np.sqrt(count):.2g}" if count > 1 else ""
+    ends = f"{_place(axis, order[0])} to {_place(axis, order[-1])}"
+    told = " (mean ± standard error of pairs)" if error else ""
+    return [f"P80 changes by {float(ratio.mean()):+.3g}{error} % from {ends}{told}."]
+
+
+def lost_cases(result: xr.Dataset) -> list[str]:
+    """Return a line for every operating point that lost replicates: status, where, why."""
+    words, axes = {number: word for word, number in STATUS.items()}, axes_of(result)
+    lost: dict[tuple, int] = {}
+    for *index, replicate in np.argwhere(result["status"].values != STATUS["ok"]):
+        case = result.isel({**dict(zip(axes, index, strict=True)), "replicate": replicate})
+        key = (*index, int(case["status"]), str(case["message"].values))
+        lost[key] = lost.get(key, 0) + 1
+    lines = []
+    for (*index, status, message), count in lost.items():
+        place = [_place(result[name], k) for name, k in zip(axes, index, strict=True)]
+        place.append(f"{count} of {result.sizes['replicate']} replicates")
+        lines.append(f"{words[status]}: {', '.join(place)}: {message}")
+    return lines
+
+
+def any_result(result: xr.Dataset) -> bool:
+    """Return whether at least one case is well."""
+    return bool((result["status"] == STATUS["ok"]).any())
+
+
+def axis_label(axis: xr.DataArray) -> str:
+    """Return a swept coordinate's name with the unit it is shown in."""
+    name, unit = axis.name.replace("_", " "), axis.attrs["units"]
+    return name if unit == "1" else f"{name} [{unit_shown(unit)[0]}]"
+
+
+def shown_values(axis: xr.DataArray) -> np.ndarray:
+    """Return a swept coordinate's values in the unit it is shown in."""
+    return axis.values * unit_shown(axis.attrs["units"])[1] if axis.dtype.kind in "fiu" else axis.values
+
+
+def value_text(axis: xr.DataArray, value) -> str:
+    """Return a value of a swept coordinate as text with its unit."""
+    return show(float(value), axis.attrs["units"]) if axis.dtype.kind in "fiu" else str(value)
+
+
+def _place(axis: xr.DataArray, index: int) -> str:
+    return f"{axis.name.replace('_', ' ')} {value_text(axis, axis.values[index])}"
+
+
+def _axis_texts(axis: xr.DataArray) -> list[str]:
+    return [f"{value:.6g}" if axis.dtype.kind in "fiu" else str(value) for value in shown_values(axis)]
