@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from hpgr import fields
-from studies.command import Overwrite, Report, Sieve, command, shown_as
+from studies.command import Overwrite, Report, Sieve, command, quantity_of, shown_as
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -38,10 +37,7 @@ def _files(options: Options) -> list[Path]:
 @command("explore", __doc__, files=_files)
 def main(options: Options) -> Report:
     """Write the page of the command line."""
-    try:
-        sieve = fields.parse(options.sieve, "m")
-    except ValueError as error:
-        raise ValueError(f"--sieve: got {options.sieve!r}; {error}") from None
+    sieve = quantity_of("--sieve", options.sieve, "m")
     library = chart_library()
     from studies.show.page import page_data, page_of
 

@@ -23,6 +23,7 @@ from studies.command import (
     Quick,
     Report,
     Seed,
+    beside,
     command,
     figure,
     progress_bar,
@@ -62,9 +63,8 @@ class Options:
 
 
 def _files(options: Options) -> list[Path]:
-    out = options.out.with_suffix(".nc")
-    pictures = [out.with_suffix(".png"), out.with_name(f"{out.stem}_euler.png")]
-    return [out, *(pictures if options.plot else [])]
+    out, *picture = beside(options)
+    return [out, *picture, *(one.with_stem(f"{one.stem}_euler") for one in picture)]
 
 
 @command("extremes", __doc__, files=_files)

@@ -219,15 +219,14 @@ def _rolls(scene: Scene) -> dict[str, Any]:
 def _fields(scene: Scene) -> dict[str, Any]:
     """Return figures 3a, 3b and 4: everything that needs no grains, on the stream tubes' centres, mid-plane and rim."""
     from hpgr.bed import geometry, kinematics, stress
+    from hpgr.bed.loaded import inputs_of
 
-    rolls, packing, substeps = scene.rolls, scene.bed, scene.elasticity.substeps
-    xi = np.array([0.0, *geometry.centres(scene.resolution.streamlines), 1.0])
-    bed = geometry.between_rolls(rolls.diameter, rolls.gap, rolls.entry_gap, xi)
-    flow = scene.flow.constants(rolls.gap, rolls.diameter, packing.feed_solid_fraction)
-    fine = (scene.resolution.points - 1) * substeps + 1
-    motion, strains = kinematics.move(bed, flow, rolls.surface_speed, fine)
-    solid = packing.feed_solid_fraction, packing.max_solid_fraction
-    state = stress.load(scene.elasticity.constants(), *solid, motion, strains)
+    inputs, substeps = inputs_of(scene), scene.elasticity.substeps
+    xi = np.array([0.0, *geometry.centres(inputs.streamlines), 1.0])
+    bed = inputs.between_rolls(xi)
+    flow, *solid = inputs.laws()
+    motion, strains = kinematics.move(bed, flow, inputs.surface_speed, inputs.stress_points)
+    state = stress.load(*solid, motion, strains)
     found = {
         "x": motion.x,
         "height": motion.y,
