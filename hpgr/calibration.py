@@ -201,27 +201,13 @@ def calibrate(
 
 
 def fit_tests(scene: Scene, tests: Sequence[PilotTest], fit: Sequence[str], feed: Feed | None = None) -> Calibration:
-    """Fit parameters of `scene` to tests, as `calibrate` does to those of files.
-
-    Examples
-    --------
-    >>> import hpgr
-    >>> from hpgr import calibration
-    >>> from hpgr.tables import read_pilot_tests
-    >>> folder = hpgr.presets.DATA
-    >>> tests = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
-    >>> coarse = {"resolution.points": 40, "resolution.streamlines": 1, "strength.cushioning": float("inf")}
-    >>> scene = hpgr.presets.khd_pilot().with_values(coarse)
-    >>> found = calibration.fit_tests(scene, tests[:1], ["gamma"])
-    >>> found.estimates["gamma"].low < found.estimates["gamma"].value < found.estimates["gamma"].high
-    True
-    """
+    """Fit parameters of `scene` to tests, as `calibrate` does to those of files."""
     names = _known_names(scene, fit)
     scene = _started(scene.with_values({"resolution.record": "product"}), names, tests[0], feed)
     trial = _Trial(scene, [_at_test(scene, test, feed) for test in tests], tests, names)
-    place = np.array([PARAMETERS[name].scaled(_value_of(scene, name)) for name in names])
-    bounds = np.array([[PARAMETERS[name].scaled(getattr(PARAMETERS[name], end)) for name in names]
-                       for end in ("low", "high")])  # fmt: skip
+    fitted = [PARAMETERS[name] for name in names]
+    bounds = np.array([[one.scaled(one.low) for one in fitted], [one.scaled(one.high) for one in fitted]])
+    place = np.array([one.scaled(_value_of(scene, name)) for one, name in zip(fitted, names, strict=True)])
     machine_part = [k for k, name in enumerate(names) if name in _OF_MACHINE]
     product_part = [k for k, name in enumerate(names) if name not in _OF_MACHINE]
     trial.refuse_unfit(place, machine_part, product_part)
@@ -410,11 +396,12 @@ def _minimise(function, start: np.ndarray, bounds: np.ndarray, free, steps) -> n
         return whole
 
     for step in steps:
-        found = least_squares(
-            lambda part: function(at(part)), place[free], bounds=bounds[:, free], xtol=1e-4, ftol=1e-5, max_nfev=40,
-            jac=lambda part, step=step: _slopes(function, at(part), bounds, free, step),
-        )  # fmt: skip
-        place = at(found.x)
+
+        def slopes(part: np.ndarray, step: float = step) -> np.ndarray:
+            return _slopes(function, at(part), bounds, free, step)
+
+        limits = {"bounds": bounds[:, free], "xtol": 1e-4, "ftol": 1e-5, "max_nfev": 40}
+        place = at(least_squares(lambda part: function(at(part)), place[free], slopes, **limits).x)
     return place
 
 
