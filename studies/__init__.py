@@ -12,6 +12,6 @@ __all__ = ["open_cases"]
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'studies' has no attribute {name!r}")
-    from studies.recorded import open_cases
+    from studies.sweep.assemble import open_cases
 
     return open_cases

@@ -1,339 +1,311 @@
-"""The command line that the sweeps over gap, speed and feed share."""
+"""What all command lines share: options, base scene, history, writing, refusing, exit codes, progress."""
 
 import functools
+import re
+import shlex
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import tyro
 from pydantic import ValidationError
 
-from hpgr import budget, presets, units
-from hpgr.keys import refuse_key
-from hpgr.scene import Scene, faults_of, field_info
+from hpgr import presets
+from hpgr.fields import check_seed, faults_of, parse
+from hpgr.scene import Scene, levels
 
 if TYPE_CHECKING:
-    import xarray as xr
+    import matplotlib.figure
 
-AXES = {
-    "gap": "rolls.gap",
-    "press_force": "rolls.specific_pressing_force",
-    "roll_speed": "rolls.speed",
-    "feed_top_size": "feed.top_size",
-}
+# A study's files name the command that made them: in the history, a PNG's "Source", a GIF's comment, a page's generator
+_PREFIX = re.compile(r"python -m studies\.\w+")
+_MARK = re.compile(rb"(?:Source\0+|!\xfe.|\"generator\" content=\")(python -m studies\.\w+)", re.DOTALL)
+_MARK_WITHIN = 1 << 16  # bytes from the beginning
 
-
-class Study(NamedTuple):
-    """One ready sweep: its name, the option of its main axis, default values as multiples, and its message."""
-
-    name: str
-    main: str
-    factors: tuple[float, ...]
-    about: str
-    caption: str
-    exchange_caption: str = ""
+Part = "xr.Dataset | Callable[[Path, str], object]"
 
 
-def shown_as(metavar: str):
-    """Return the word by which `--help` shows an option's value."""
-    return tyro.conf.arg(metavar=metavar)
+# ---- options
 
 
-@dataclass(frozen=True)
-class Options:
-    """Options of a sweep; quantities are text with a unit, such as "60 mm" or "19 rpm"."""
-
-    gap: Annotated[tuple[str, ...] | None, shown_as("LENGTH ...")] = None
-    """Gaps to sweep, such as --gap "40 mm" "60 mm"."""
-    press_force: Annotated[tuple[str, ...] | None, shown_as("PRESSURE ...")] = None
-    """Specific pressing forces F/(D L) to sweep, such as --press-force "2.5 N/mm^2" "4 N/mm^2"; the gap then floats."""
-    roll_speed: Annotated[tuple[str, ...] | None, shown_as("SPEED ...")] = None
-    """Roll speeds to sweep, such as --roll-speed "15 rpm" "19 rpm"."""
-    feed_top_size: Annotated[tuple[str, ...] | None, shown_as("LENGTH ...")] = None
-    """Top sizes of the feed to sweep, such as --feed-top-size "40 mm" "60 mm"."""
-    scene: Annotated[str, shown_as("PRESET|FILE")] = "paper"
-    """Base scene: a preset (paper, khd_pilot), or the path of a .toml or .json scene file."""
-    replicates: Annotated[int, shown_as("N")] = 3
-    """Independent repetitions of every operating point; they make the spread."""
-    level: Annotated[Literal["draft", "standard", "fine"] | None, shown_as("draft|standard|fine")] = None
-    """Named resolution instead of the scene's, with measured error and cost (docs/accuracy.md)."""
-    cells: Annotated[int | None, shown_as("N")] = None
-    """Cells per material point (default: the scene's); 0 computes stress only."""
-    points: Annotated[int | None, shown_as("N")] = None
-    """Material points per streamline (default: the scene's)."""
-    streamlines: Annotated[int | None, shown_as("N")] = None
-    """Streamlines from the mid-plane to the roll (default: the scene's)."""
-    tolerance: Annotated[float | None, shown_as("X")] = None
-    """Relative error wanted, such as 0.01: every operating point is refined until its estimate is below it."""
-    max_cost: Annotated[float, shown_as("SECONDS")] = 60.0
-    """Predicted time that meeting the tolerance may take at an operating point."""
-    sieve: Annotated[str, shown_as("LENGTH")] = "1 mm"
-    """Sieve whose percent passing is shown."""
-    workers: Annotated[int, shown_as("N")] = 2
-    """Threads of this process to run cases on; without effect beside --scheduler."""
-    scheduler: Annotated[str | None, shown_as("ADDRESS")] = None
-    """Running dask scheduler to use instead, such as tcp://127.0.0.1:8786."""
-    exchange: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Switch on segregation and mixing between streamlines, as the scene says, or else with default strength."""
-    record: Literal["product", "distributions", "cells"] = "product"
-    """What is kept of every case beside its summary: a file of distributions or cells, for studies.open_cases."""
-    timeout: Annotated[float | None, shown_as("SECONDS")] = None
-    """Time that a case may take; cases then run in processes of their own, and one that hangs or dies is named."""
-    force: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Compute every case, also those that are finished already in <out>.cases."""
-    seed: Annotated[int, shown_as("N")] = 0
-    """Seed of all randomness; the same seed gives the same bits."""
-    out: Annotated[Path | None, shown_as("FILE")] = None
-    """NetCDF file to write (default: outputs/<study>.nc); beside it the figure, .png, and finished cases, .cases."""
-    plot: bool = True
-    """Draw the figure, or not."""
-    dry_run: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """List the cases with their predicted memory and time, say which are finished already, and run none."""
+def shown_as(metavar: str, words: str | None = None) -> Any:
+    """Return what has `--help` show an option's value as `metavar`, and describe it in these words."""
+    return tyro.conf.arg(metavar=metavar, help=words)
 
 
-def refusing(command: Callable[..., int]) -> Callable[..., int]:
-    """Make a command print what it refuses as one clear error, and return exit code 2."""
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]  # which is off unless it is given
+_LEVELS = tuple(levels())
 
-    @functools.wraps(command)
-    def wrapped(*args, **kwargs) -> int:
-        try:
-            return command(*args, **kwargs)
-        except ValidationError as error:
-            message = "the scene is refused:\n  " + faults_of(error, separator="\n  ")
-        except (OSError, ValueError, MemoryError) as error:
-            message = str(error)
-        except KeyboardInterrupt:
-            print("interrupted; finished cases are kept, and the same command goes on from there", file=sys.stderr)
-            return 130
-        print(f"error: {message}", file=sys.stderr)
-        return 2
-
-    return wrapped
-
-
-@refusing
-def run(study: Study, arguments: Sequence[str] | None = None) -> int:
-    """Run a study from the command line; return its exit code.
-
-    0: every case is well. 1: some cases hold no result, named on standard error. 2: nothing was run or written.
-    """
-    options = tyro.cli(Options, prog=f"python -m studies.{study.name}", description=study.about, args=arguments)
-    chosen = {name: getattr(options, name) for name in ("level", "cells", "points", "streamlines")}
-    scene = base_scene(options.scene, **{name: value for name, value in chosen.items() if value is not None})
-    if options.exchange and scene.exchange is None:
-        scene = scene.with_values({"exchange": {}})
-    study = _floating(study, options)
-    axes = _axes(study, options, scene)
-    sieve = _sieve(options, scene)
-    if min(options.workers, options.replicates) < 1:
-        raise ValueError(f"got --workers {options.workers} --replicates {options.replicates}; both must be at least 1")
-    refuse_key("--seed", options.seed)
-    _check_tolerance(options)
-    if options.timeout is not None and not 0.1 <= options.timeout <= 1e6:
-        raise ValueError(f"--timeout: got {options.timeout:g}; must be 0.1 to 1,000,000 s; such as 60")
-    if options.dry_run:
-        _print_cases(scene, axes, options, _folder(study, options))
-        return 0
-    from studies import store
-
-    out = _out(study, options)
-    store.probe(out)
-    result = _sweep(scene, axes, options, _folder(study, options))
-    result.attrs["history"] = _command_line(study, arguments)
-    return _report(study, options, result, sieve, out)
+SceneName = Annotated[
+    str, shown_as("PRESET|FILE", f"Base scene: a preset ({', '.join(presets.NAMES)}), or a .toml or .json scene file.")
+]
+Level = Annotated[
+    Literal[_LEVELS] | None,
+    shown_as(
+        "|".join(_LEVELS), "Named resolution instead of the scene's, with measured error and cost (docs/accuracy.md)."
+    ),
+]
+Cells = Annotated[
+    int | None, shown_as("N", "Cells per material point, instead of the scene's; 0 computes stress only.")
+]
+Points = Annotated[int | None, shown_as("N", "Material points per streamline, instead of the scene's.")]
+Streamlines = Annotated[
+    int | None, shown_as("N", "Streamlines from the mid-plane to the roll, instead of the scene's.")
+]
+Exchange = Annotated[
+    Flag, shown_as("", "Switch on segregation and mixing, as the scene says, or else with default strength.")
+]
+Replicates = Annotated[int, shown_as("N", "Independent repetitions of every operating point; they make the spread.")]
+Seed = Annotated[int, shown_as("N", "Seed of all randomness; the same seed gives the same bits.")]
+Sieve = Annotated[str, shown_as("LENGTH", "Sieve whose percent passing is shown.")]
+Quick = Annotated[Flag, shown_as("", "Fewer and coarser runs: seconds instead of minutes, to see what comes out.")]
+Out = Annotated[Path, shown_as("FILE", "NetCDF file to write; the figure goes beside it, as .png.")]
+Plot = Annotated[bool, shown_as("", "Draw the figure, or not.")]
+Overwrite = Annotated[Flag, shown_as("", "Replace files that are not this command's own earlier result.")]
 
 
-def _check_tolerance(options: Options) -> None:
-    if options.tolerance is None:
-        return
-    if not 1e-4 <= options.tolerance <= 0.5:
-        raise ValueError(f"--tolerance: got {options.tolerance:g}; must be within 0.0001 to 0.5; such as 0.01")
-    given = [name for name in ("level", "cells", "points") if getattr(options, name) is not None]
-    if given:
-        raise ValueError(
-            f"--{given[0]}: got it beside --tolerance, which chooses points and cells itself; give one of them"
-        )
+def base_scene(options: Any, **resolution: Any) -> Scene:
+    """Return the scene of a preset or file, with the resolution and exchange that are asked for.
 
-
-def base_scene(name: str, **resolution: int | str) -> Scene:
-    """Return the scene of a preset or file, with another resolution.
+    Parameters
+    ----------
+    options : str or object
+        Name of the scene; or options that have it as `scene`, and may have level, cells, points, streamlines and
+        exchange.
+    **resolution
+        Other values of `Scene.resolution`, or a `level`; None leaves the scene's.
 
     Raises
     ------
     ValueError
         If there is no such scene, or it is impossible.
     """
-    if name in presets.PRESETS:
-        scene = presets.PRESETS[name]()
-    elif Path(name).suffix in {".toml", ".json"}:
-        try:
-            scene = Scene.from_file(name)
-        except OSError as error:
-            raise ValueError(f"--scene: cannot read {name!r}: {error.strerror}") from None
-    else:
+    given = {name: getattr(options, name, None) for name in ("level", "cells", "points", "streamlines")} | resolution
+    given = {name: value for name, value in given.items() if value is not None}
+    level = given.pop("level", None)
+    values = (levels()[level].values() if level else {}) | given
+    scene = _named_scene(options if isinstance(options, str) else options.scene)
+    scene = scene.with_values({f"resolution.{name}": value for name, value in values.items()})
+    on = getattr(options, "exchange", False) and scene.exchange is None
+    return scene.with_values({"exchange": {}}) if on else scene
+
+
+def _named_scene(name: str) -> Scene:
+    if name in presets.NAMES:
+        return Scene.preset(name)
+    if Path(name).suffix not in {".toml", ".json"}:
         raise ValueError(
-            f"--scene: got {name!r}; must be a preset ({', '.join(presets.PRESETS)}) or a .toml or .json file"
+            f"--scene: got {name!r}; must be a preset ({', '.join(presets.NAMES)}) or a .toml or .json file"
         )
-    return scene.with_values({f"resolution.{key}": value for key, value in resolution.items()})
-
-
-def _floating(study: Study, options: Options) -> Study:
-    """Return a study of the gap as one of the pressing force, if forces are given: the gap then floats."""
-    if study.main != "gap" or options.press_force is None:
-        return study
-    if options.gap is not None:
-        raise ValueError("--gap: got it beside --press-force, under which the gap floats; give one of them")
-    return study._replace(main="press_force", caption="The gap floats under the pressing force; the nip angle is held.")
-
-
-def _axes(study: Study, options: Options, scene: Scene) -> dict[str, list]:
-    """Return the swept fields with their values, the study's own first."""
-    if scene.feed.kind == "single" and (study.main == "feed_top_size" or options.feed_top_size):
-        raise ValueError("--feed-top-size: the scene's feed is of a single size and has no top; sweep another feed")
-    order = [study.main, *(name for name in AXES if name != study.main)]
-    axes = {AXES[name]: list(getattr(options, name)) for name in order if getattr(options, name) is not None}
-    if getattr(options, study.main) is None:
-        axes = {AXES[study.main]: _default_values(study, scene), **axes}
-    from studies.sweep import axis_values  # late, like all that --help does without
-
-    return axis_values(axes)
-
-
-def _default_values(study: Study, scene: Scene) -> list[float]:
-    """Return the scene's own value times the study's factors."""
-    section, key = AXES[study.main].split(".")
-    own = getattr(getattr(scene, section), key)
-    if own is None and key == "top_size":
-        own = scene.feed.coarsest
-    shown = units.SHOWN[field_info(AXES[study.main]).unit][1]
-    return [own if factor == 1 else float(f"{own * factor * shown:.3g}") / shown for factor in study.factors]
-
-
-def _sieve(options: Options, scene: Scene) -> float:
-    known = scene.resolution.sieves
     try:
-        sieve = units.parse(options.sieve, "m")
+        return Scene.from_file(name)
+    except OSError as error:
+        raise ValueError(f"--scene: cannot read {name!r}: {error.strerror}") from None
+
+
+def quantity_of(option: str, text: str, unit: str) -> float:
+    """Return the SI value of an option's text, such as "1 mm"; a ValueError names the option."""
+    try:
+        return parse(text, unit)
     except ValueError as error:
-        raise ValueError(f"--sieve: got {options.sieve!r}; {error}") from None
-    if not known[0] <= sieve <= known[-1]:
-        raise ValueError(
-            f"--sieve: got {options.sieve!r}; must lie within the scene's sieves, "
-            f"{units.show(known[0], 'm')} to {units.show(known[-1], 'm')}"
-        )
-    return sieve
+        raise ValueError(f"{option}: got {text!r}; {error}") from None
 
 
-def _sweep(scene: Scene, axes: dict[str, list], options: Options, folder: Path) -> "xr.Dataset":
-    from studies.sweep import sweep
-
-    common = {
-        "tolerance": options.tolerance,
-        "max_cost": options.max_cost,
-        "replicates": options.replicates,
-        "seed": options.seed,
-        "progress": True,
-        "folder": folder,
-        "force": options.force,
-        "timeout": options.timeout,
-        "record": options.record,
-    }
-    if options.scheduler is None:
-        return sweep(scene, axes, threads=options.workers, **common)
-    from distributed import Client
-
-    with Client(options.scheduler, timeout="10s") as client:
-        return sweep(scene, axes, client=client, **common)
+# ---- one main
 
 
-def _print_cases(scene: Scene, axes: dict[str, list], options: Options, folder: Path) -> None:
-    from studies.sweep import enumerate_cases, finished_cases
+class Report(NamedTuple):
+    """What a study hands to its command line.
 
-    scene = scene.with_values({"resolution.record": options.record})
-    kept = finished_cases(scene, axes, options.replicates, folder, options.seed, options.tolerance, options.max_cost)
-    if options.force:
-        kept = dict.fromkeys(kept, 0)
-    shows_kept = any(kept.values())
-    print(f"{scene}\n")
-    names = list(axes)
-    heading = "".join(f"{_heading(name):>24}" for name in names) + f"{'memory':>12}{'time':>12}"
-    print(heading + (f"{'finished':>14}" if shows_kept else ""))
-    total = 0.0
-    for case in enumerate_cases(axes, 1):
-        shown = "".join(f"{units.show(case.values[name], field_info(name).unit):>24}" for name in names)
-        try:
-            cost = budget.predict(scene.with_values(case.values))
-        except ValidationError as error:
-            print(f"{shown}  refused: {faults_of(error)}")
-            continue
-        done = kept[case.index[:-1]]
-        total += cost.seconds * (options.replicates - done)
-        told = f"{f'{done} of {options.replicates}':>14}" if shows_kept else ""
-        print(f"{shown}{cost.bytes / 1e6:>9.1f} MB{cost.seconds * 1e3:>9.1f} ms{told}")
-    if options.tolerance is not None:
-        print(f"\nbefore refinement: --tolerance {options.tolerance:g} chooses points and cells when a case is run")
-    count, done = options.replicates * len(kept), sum(kept.values())
-    finished = f"{done} of them finished already in {folder}; the others " if done else ""
-    print(f"\n{count} cases ({options.replicates} replicates each), {finished}about {total / options.workers:.2g} s on "
-          f"{options.workers} threads, plus start-up")  # fmt: skip
+    Attributes
+    ----------
+    lines : sequence of str
+        What is printed when the files stand.
+    parts : sequence
+        What goes into the command's files, in their order: a Dataset, or a function that writes a file, given its
+        path and the command line that made it. Fewer paths than parts leave the last ones out.
+    faults : sequence of str
+        What is printed on standard error; any makes the exit code 1.
+    """
+
+    lines: Sequence[str] = ()
+    parts: Sequence[Part] = ()
+    faults: Sequence[str] = ()
 
 
-def _report(study: Study, options: Options, result: "xr.Dataset", sieve: float, out: Path) -> int:
-    """Write the files, print the table, and return the exit code."""
-    from studies import report, store
+def file_of(out: Path, suffix: str = ".nc") -> Path:
+    """Return the path that `--out` asks for, with its suffix."""
+    if not out.name:
+        raise ValueError(f"--out: got {str(out)!r}; must be the name of a file; such as --out outputs/mine{suffix}")
+    return out if out.suffix == suffix else out.with_name(out.name + suffix)
 
-    lost = report.lost_cases(result)
-    for line in lost:
-        print(line, file=sys.stderr)
-    if not report.any_result(result):
-        print("no case holds a result; nothing was written", file=sys.stderr)
-        return 1
-    sayings = [*report.change(result, AXES[study.main]), _caption(study, result)]
+
+def beside(options: Any) -> list[Path]:
+    """Return the files of most studies: a NetCDF file, and a figure beside it unless there is to be none."""
+    out = file_of(options.out)
+    return [out, out.with_suffix(".png")] if options.plot else [out]
+
+
+Study = Callable[[Any], Report]
+Files = Callable[[Any], list[Path]]
+
+
+def command(name: str, about: str, files: Files = beside) -> Callable[[Study], Callable[..., int]]:
+    """Make a study, a function of its options, into the main function of `python -m studies.<name>`.
+
+    Parameters
+    ----------
+    name, about : str
+        Name of the study, and what it does, for `--help`.
+    files : function
+        Paths that these options have written. They are looked at before the study runs, and written after it.
+
+    Returns
+    -------
+    A decorator; what it makes takes arguments (default: the command line's) and returns an exit code. 0: all is well.
+    1: the report tells of faults. 2: the input is refused, or the result cannot be written. 130: interrupted.
+    """
+
+    def decorate(study: Study) -> Callable[..., int]:
+        [kind] = (kind for argument, kind in study.__annotations__.items() if argument != "return")
+
+        @functools.wraps(study)
+        def main(arguments: Sequence[str] | None = None) -> int:
+            options = tyro.cli(kind, prog=f"python -m studies.{name}", description=about, args=arguments)
+            given = sys.argv[1:] if arguments is None else arguments
+            return _exit_code(study, options, files, f"python -m studies.{name} {shlex.join(given)}".strip())
+
+        del main.__wrapped__  # whose signature is the study's
+        return main
+
+    return decorate
+
+
+def _exit_code(study: Study, options: Any, files: Files, line: str) -> int:
+    """Run a study; print what is refused as one clear error."""
     try:
-        store.write_dataset(result, out)
-        written = [out]
-        if options.plot:
-            from studies.plots import sweeps as plots
+        return _run(study, options, files, line)
+    except ValidationError as error:
+        message = "the scene is refused:\n  " + faults_of(error, separator="\n  ")
+    except (OSError, ValueError, MemoryError) as error:
+        message = str(error)
+    except KeyboardInterrupt:
+        print(
+            "interrupted; a sweep's finished cases are kept, and the same command goes on from there", file=sys.stderr
+        )
+        return 130
+    print_plainly(f"error: {message}", file=sys.stderr)
+    return 2
 
-            figure = plots.sweep_figure(result, AXES[study.main], sieve, "\n".join(sayings))
-            store.replace(out.with_suffix(".png"), lambda part: figure.savefig(part, dpi=150))
-            written.append(out.with_suffix(".png"))
+
+def _run(study: Study, options: Any, files: Files, line: str) -> int:
+    check_seed("--seed", getattr(options, "seed", 0))
+    paths = files(options)
+    for path in paths:
+        _refuse_foreign(path, line, options.overwrite)
+    report = study(options)
+    try:
+        written = [_write(part, path, line) for path, part in zip(paths, report.parts, strict=False)]
     except OSError as error:
         raise OSError(f"could not write the result: {error}") from error
-    print(report.table(result, sieve))
-    for line in (*report.notes(result), *sayings):
-        print(line)
-    print("wrote " + " and ".join(map(str, written)))
-    return 1 if lost else 0
+    print_plainly(*report.lines)
+    print_plainly(*report.faults, file=sys.stderr)
+    if written:
+        print("wrote " + " and ".join(filter(None, (", ".join(written[:-1]), written[-1]))))
+    return 1 if report.faults else 0
 
 
-def _out(study: Study, options: Options) -> Path:
-    out = options.out or Path("outputs") / f"{study.name}.nc"
-    return out if out.suffix == ".nc" else out.with_name(out.name + ".nc")
+def print_plainly(*lines: str, file: Any = None) -> None:
+    """Print lines in which what would steer the terminal is written out: files and scenes may be anybody's."""
+    for line in lines:
+        print(re.sub(r"[^\n -~\u00a0-\U0010ffff]", lambda found: ascii(found[0])[1:-1], line), file=file)
 
 
-def _folder(study: Study, options: Options) -> Path:
-    """Return where finished cases are kept."""
-    return _out(study, options).with_suffix(".cases")
+# ---- files
 
 
-def _caption(study: Study, result: "xr.Dataset") -> str:
-    exchange = Scene.model_validate_json(result.attrs["scene"]).exchange
-    return study.caption if exchange is None or not study.exchange_caption else study.exchange_caption
+def _write(part: Part, path: Path, line: str) -> str:
+    from studies.sweep import netcdf
+
+    if callable(part):
+        netcdf.replace(path, lambda temporary: part(temporary, line))
+    else:
+        netcdf.write_dataset(part.assign_attrs(history=line), path)
+    return str(path)
 
 
-def _heading(name: str) -> str:
-    info = field_info(name)
-    shown = units.SHOWN.get(info.unit, (info.unit,))[0]
-    return f"{AXES_BY_FIELD.get(name, name)} [{shown}]"
+def figure(draw: "Callable[[], matplotlib.figure.Figure]", dpi: int = 150) -> Part:
+    """Return what writes the figure that `draw` makes, and in it the command line that made it."""
+    return lambda path, line: draw().savefig(path, dpi=dpi, metadata={"Source": line})
 
 
-AXES_BY_FIELD = {field: name.replace("_", " ") for name, field in AXES.items()}
+def _refuse_foreign(path: Path, line: str, overwrite: bool) -> None:
+    """Raise if a file cannot be written, or one is there that is not this command's own earlier result.
+
+    Raises
+    ------
+    OSError, ValueError
+        Naming the file, what it holds, and the remedy.
+    """
+    from studies.sweep import netcdf
+
+    netcdf.probe(path)
+    if overwrite or not path.exists():
+        return
+    remedy = "give --out another name, or --overwrite to replace it"
+    if not path.stat().st_mode & 0o222:
+        raise ValueError(f"--out: got {path}, which is read-only; {remedy}")
+    maker = _maker(path)
+    if maker is None:
+        raise ValueError(f"--out: got {path}, which no study has written; {remedy}")
+    same = _named(maker)[:1] == _named(line)[:1] and (path.suffix != ".nc" or _named(maker) == _named(line))
+    if not same:
+        raise ValueError(f"--out: got {path}, which is the result of another command, `{maker}`; {remedy}")
 
 
-def _command_line(study: Study, arguments: Sequence[str] | None) -> str:
-    import shlex
+def _maker(path: Path) -> str | None:
+    """Return the command line that made a file, of a picture or page its beginning; None if it is no study's."""
+    from studies.sweep import netcdf
 
-    given = sys.argv[1:] if arguments is None else arguments
-    return f"python -m studies.{study.name} {shlex.join(given)}".strip()
+    if path.suffix != ".nc":
+        with path.open("rb") as file:
+            found = _MARK.search(file.read(_MARK_WITHIN))
+        return found[1].decode() if found else None
+    try:
+        with netcdf.open_result(path) as dataset:
+            found = str(dataset.attrs.get("history"))
+    except (OSError, ValueError):
+        return None
+    return found if _PREFIX.match(found) else None
+
+
+def _named(line: str) -> tuple[str, str]:
+    """Return the study and the scene that a command line names."""
+    words = shlex.split(line.replace(" --scene=", " --scene "))
+    return words[2], words[words.index("--scene") + 1] if "--scene" in words[:-1] else ""
+
+
+# ---- progress
+
+
+def progress_bar(total: int, progress: bool, unit: str, line: str = "{elapsed}", done: int = 0) -> Any:
+    """Return a progress bar; where no terminal is watching, a plain line every few seconds.
+
+    Parameters
+    ----------
+    total, done : int
+        How many there are, and how many of them are finished already.
+    progress : bool
+        Whether to show anything.
+    unit : str
+        What is counted.
+    line : str
+        What the plain line says behind the count, as tqdm's `bar_format` has it.
+    """
+    from tqdm.auto import tqdm  # late: `--help` does without
+
+    common = {"total": total, "initial": done, "unit": f" {unit}", "disable": not progress}
+    if sys.stderr.isatty():
+        return tqdm(**common)
+    return tqdm(**common, bar_format=f"{{n_fmt}} of {{total_fmt}} {unit}, {line}\n", mininterval=5)

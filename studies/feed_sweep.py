@@ -1,8 +1,6 @@
 """Feed top size against throughput, fineness and pressure: `python -m studies.feed_sweep`."""
 
-from collections.abc import Sequence
-
-from studies.command import Study, run
+from studies.sweep.study import Study, sweep_command
 
 STUDY = Study(
     name="feed_sweep",
@@ -18,11 +16,7 @@ STUDY = Study(
     ),
 )
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the study and return its exit code; `arguments` default to the command line's."""
-    return run(STUDY, arguments)
-
+main = sweep_command(STUDY)
 
 if __name__ == "__main__":
     raise SystemExit(main())

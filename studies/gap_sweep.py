@@ -1,8 +1,6 @@
 """Gap against throughput, fineness and pressure: `python -m studies.gap_sweep`."""
 
-from collections.abc import Sequence
-
-from studies.command import Study, run
+from studies.sweep.study import Study, sweep_command
 
 STUDY = Study(
     name="gap_sweep",
@@ -15,11 +13,7 @@ STUDY = Study(
     caption="While the gap varies, the entry gap is held: the modelled bed reaches up to the same place.",
 )
 
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the study and return its exit code; `arguments` default to the command line's."""
-    return run(STUDY, arguments)
-
+main = sweep_command(STUDY)
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -1,0 +1,243 @@
+"""Results of cases -> one labelled Dataset: of summaries as they come in, and of cases recorded whole, lazily."""
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from hpgr.results import schema
+from hpgr.scene import Scene
+from studies.sweep import netcdf
+from studies.sweep.run import Plan
+from studies.sweep.space import AXES, CaseResult, Space
+
+_MANIFEST = "sweep.json"
+_MOST_BYTES = 100_000_000  # of a manifest that is read: two million cases
+_FORMAT = 2
+_ADDRESS = re.compile("[0-9a-f]{32}")
+_IN_FILES = {"time": "snapshot"}  # names that differ in files, see `netcdf.write_dataset`
+
+
+def assemble(plan: Plan, results: Iterable[CaseResult]) -> xr.Dataset:
+    """Return one Dataset of all results over the axes and replicates, the same whatever their order."""
+    spec, space = plan.spec, plan.space
+    values: dict[str, Any] = _of_axes(space)
+    values |= {
+        "status": np.full(space.shape, schema.STATUS["failed"], np.int8),
+        "message": np.full(space.shape, "", object),
+        "diagnostics": np.full(space.shape, "", object),
+    }
+    uneven: set[str] = set()
+    for result in results:
+        values["status"][result.index] = schema.STATUS[result.status]
+        values["message"][result.index], values["diagnostics"][result.index] = result.message, result.diagnostics
+        for name, value in result.summary.items():
+            if name in schema.COORDINATES:  # the same for every case that has it
+                known = values.setdefault(name, value)
+            else:
+                stack = values.setdefault(name, _blank((*space.shape, *value.shape), value.dtype))
+                known = stack[result.index]
+                stack[result.index] = value if known.shape == value.shape else 0
+            if known.shape != value.shape:  # an axis over the number of streamlines or sieves makes it ragged
+                uneven.add(name)
+    attrs = schema.dataset_attributes(
+        "Parametric study of comminution in high pressure grinding rolls",
+        scene=spec.base.model_dump_json(),
+        axes=", ".join(space.grid),
+        seed=spec.seed,
+        replicates=space.replicates,
+        left_out=", ".join(sorted(uneven)),
+        level=spec.base.resolution.level(),
+    )
+    attrs |= {} if spec.tolerance is None else {"tolerance": spec.tolerance}
+    order = [*space.dims, *schema.COORDINATES, *schema.VARIABLES, *schema.SWEEP]
+    found = {name: values[name] for name in order if name in values and name not in uneven}
+    return _labelled(space, found, attrs).assign_coords(_held(spec.base, space))
+
+
+def _of_axes(space: Space) -> dict[str, Any]:
+    """Return the coordinates along the dimensions of a sweep."""
+    axes = {dim: np.array(values) for dim, values in zip(space.dims, space.grid.values(), strict=False)}
+    return axes | {"replicate": np.arange(space.replicates)}
+
+
+def _labelled(space: Space, values: dict[str, Any], attrs: dict[str, Any]) -> xr.Dataset:
+    """Return arrays over the dimensions of a sweep and those of a simulation as a Dataset."""
+    own = {dim: schema.field_axis(field, dim) for field, dim in zip(space.grid, space.dims, strict=False)}
+    for name, entry in (schema.COORDINATES | schema.VARIABLES | schema.SWEEP).items():
+        common = name in space.dims or (name in schema.COORDINATES and name in (*entry.dims, "width_position"))
+        if not common:
+            own[name] = entry._replace(dims=(*space.dims, *entry.dims))
+    return schema.to_dataset(values, attrs, own)
+
+
+def _held(base: Scene, space: Space) -> dict[str, xr.Variable]:
+    """Return what a sweep holds fixed of gap, force, speed and feed top size, as scalar coordinates."""
+    rolls, feed = base.rolls, base.feed
+    floating = rolls.specific_pressing_force or AXES["press_force"] in space.grid
+    fed = any(name.startswith("feed") for name in space.grid)
+    held = {
+        "gap": None if floating else rolls.gap,
+        "press_force": rolls.specific_pressing_force,
+        "roll_speed": rolls.speed,
+        "feed_top_size": None if fed else feed.largest_grain,
+    }
+    return {
+        dim: xr.Variable((), value, schema.field_axis(AXES[dim], dim).attributes())
+        for dim, value in held.items()
+        if value is not None and AXES[dim] not in space.grid
+    }
+
+
+def _blank(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """Return an array of NaN, or of zeros for integers, whose status tells that they are none."""
+    return np.full(shape, np.nan if dtype.kind == "f" else 0, dtype)
+
+
+# ---- cases recorded whole
+
+
+def write_manifest(plan: Plan, result: xr.Dataset) -> None:
+    """Write what `open_cases` needs: axes, and the address and status of every case.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; the one of an earlier sweep is then left as it was.
+    """
+    told = {
+        "axes": plan.space.grid,
+        "replicates": plan.space.replicates,
+        "addresses": plan.addresses,
+        "status": result["status"].values.ravel().tolist(),
+        "attrs": {name: value for name, value in result.attrs.items() if name != "left_out"},
+    }
+    text = json.dumps({"format": _FORMAT, "checksum": _checksum(told), "sweep": told})
+    netcdf.replace(plan.kept.folder / _MANIFEST, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+def _checksum(told: Any) -> str:
+    return hashlib.blake2b(json.dumps(told).encode(), digest_size=16).hexdigest()
+
+
+def open_cases(folder: str | Path) -> xr.Dataset:
+    """Open the cases that a sweep has recorded whole, as one lazy Dataset.
+
+    Parameters
+    ----------
+    folder : path
+        Folder of cases of a sweep with record "distributions" or "cells", such as ``outputs/gap_sweep.cases``.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dims: the axes of the latest such sweep, replicate, then those of `hpgr.simulate`. Every variable is a dask
+        array with one chunk per case, read when it is needed, one file at a time. A case that holds no result is
+        NaN (0 for integers; see `status`). A variable whose shape differs from case to case is left out, and named
+        in the attribute `left_out`.
+
+    Raises
+    ------
+    ValueError
+        If the folder has no such sweep, or a file is not the case that its name tells.
+    OSError
+        If a file cannot be read, or is damaged.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import hpgr, studies
+    >>> from studies.sweep import sweep
+    >>> base = hpgr.presets.paper().with_values({"resolution.cells": 100, "resolution.points": 50})
+    >>> folder = tempfile.TemporaryDirectory()
+    >>> _ = sweep(base, {"rolls.gap": ["40 mm", "60 mm"]}, record="distributions", folder=folder.name)
+    >>> cases = studies.open_cases(folder.name)
+    >>> cases["mass_fraction"].chunksizes["gap"]
+    (1, 1)
+    >>> folder.cleanup()
+    """
+    folder = Path(folder)
+    told = _manifest(folder / _MANIFEST)
+    space = Space(told["axes"], told["replicates"])
+    values = _of_axes(space) | {"status": np.array(told["status"]).reshape(space.shape)}
+    paths = [
+        str(folder / f"{address}.nc") if code == schema.STATUS["ok"] else ""
+        for address, code in zip(told["addresses"], told["status"], strict=True)
+    ]
+    files = [path for path in paths if path]
+    same_grid = not any(name.startswith(("resolution", "exchange")) for name in space.grid)
+    shapes = _shapes(files[:1] if same_grid else files)
+    left_out = sorted(name for name, sizes in shapes.items() if sizes is None)
+    lazy = _lazily(np.array(paths, object).reshape(space.shape))
+    for name in (name for name in shapes if name not in left_out):
+        entry = schema.COORDINATES.get(name) or schema.VARIABLES[name]
+        if entry.dims == (name,):  # the same for every case
+            values[name] = netcdf.read_variable(files[0], _IN_FILES.get(name, name))
+        else:
+            values[name] = lazy(name, shapes[name], np.dtype(entry.dtype))
+    return _labelled(space, values, told["attrs"] | {"left_out": ", ".join(left_out)})
+
+
+def _manifest(path: Path) -> dict[str, Any]:
+    """Return what a folder's manifest tells, if it is whole and ours."""
+    remedy = "run the sweep again, which writes it anew"
+    if not path.is_file():
+        raise ValueError(
+            f"{path.parent}: holds no cases recorded whole; sweep with record='distributions' or 'cells' first"
+        )
+    if path.stat().st_size > _MOST_BYTES:
+        raise ValueError(f"{path}: has more than {_MOST_BYTES:,} bytes; {remedy}")
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        if told["format"] != _FORMAT:
+            raise ValueError(f"format {told['format']!r} is not known, must be {_FORMAT}")
+        if told["checksum"] != _checksum(told["sweep"]):
+            raise ValueError("its checksum differs")
+        outside = next((each for each in told["sweep"]["addresses"] if not _ADDRESS.fullmatch(each)), None)
+        if outside is not None:
+            raise ValueError(f"{outside!r} is no address of a case")
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise ValueError(f"{path}: damaged ({error}); {remedy}") from None
+    return told["sweep"]
+
+
+def _shapes(paths: list[str]) -> dict[str, tuple[int, ...] | None]:
+    """Return the shape of every variable, or None if the files differ in it."""
+    shapes: dict[str, tuple[int, ...] | None] = {}
+    own = {stored: name for name, stored in _IN_FILES.items()}
+    for path in paths:
+        for stored, shape in netcdf.shapes_in(path).items():
+            name = own.get(stored, stored)
+            if name in schema.COORDINATES or name in schema.VARIABLES:
+                shapes[name] = shape if shapes.get(name, shape) == shape else None
+    return shapes
+
+
+def _lazily(paths: np.ndarray) -> Callable[[str, tuple[int, ...], np.dtype], Any]:
+    """Return what makes of a variable of all cases a dask array, one chunk per case."""
+    import dask.array as da
+
+    files = da.from_array(paths, chunks=1)
+
+    def lazy(name: str, shape: tuple[int, ...], dtype: np.dtype) -> Any:
+        axes = list(range(files.ndim, files.ndim + len(shape)))
+        chunks = files.chunks + tuple((size,) for size in shape)
+        meta = np.empty((0,) * (files.ndim + len(shape)), dtype)
+        return da.map_blocks(_read, files, name, shape, dtype, chunks=chunks, new_axis=axes, dtype=dtype, meta=meta)
+
+    return lazy
+
+
+def _read(path: np.ndarray, name: str, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """Return one variable of one case, or blanks for a case without a result."""
+    lead = (1,) * path.ndim
+    [path] = path.ravel().tolist()
+    if not path:
+        return _blank((*lead, *shape), dtype)
+    found = netcdf.read_variable(path, name, address=Path(path).stem)
+    return found.astype(dtype, copy=False).reshape(*lead, *shape)

@@ -1,0 +1,353 @@
+"""Cases to dask and back: a bounded number in flight, and a case that takes its worker down loses only itself."""
+
+import queue
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from hpgr import cost
+from hpgr.bed.loaded import Beds
+from hpgr.fields import faults_of
+from hpgr.results import schema
+from hpgr.run import Result, attributes, run_scene
+from hpgr.tolerance import refine
+from studies.sweep.cases import Addresses, CaseFolder, code_version, result_of, say
+from studies.sweep.space import Case, CaseResult, Space, SweepSpec
+
+Task = Callable[[SweepSpec, list[Case]], list[CaseResult]]
+
+_AHEAD = 4  # batches in flight for each thread of the workers: enough that none waits for the driver
+_AHEAD_WHOLE = 2  # the same where cases are told whole, which takes memory
+_BATCH = 32  # cases a task holds at most: dask's cost of about 1 ms per task is then under 1 % of a case's
+_BATCH_SECONDS = 2.0  # predicted for a task at most, so that progress shows and little is lost with a worker
+_PREDICTED = 100  # operating points whose cost is predicted; that of more is scaled up
+_TICK = 0.2  # s between looks at what other drivers have finished
+_PATIENCE = 5.0  # s of waiting for other drivers before the user is told of them; then twice as long each time
+
+
+class OtherCode(RuntimeError):
+    """A worker whose code differs from the driver's: its bits would not be those that the address tells."""
+
+
+# ---- one case
+
+
+class Runner:
+    """Runs the cases of a batch one after the other, and keeps what the next may share: scene and loaded bed."""
+
+    def __init__(self, spec: SweepSpec, at_once: int = 1):
+        self.spec = spec
+        self._scene, self._chosen = spec.base, {}
+        self._values: dict[str, Any] | None = None
+        self._beds = Beds(1)
+        self._room = _room(at_once)
+
+    def run(self, case: Case) -> Result:
+        """Return the results of a case, as `hpgr.simulate` would."""
+        if case.values != self._values:
+            self._values = None  # a refused scene must not be taken for the next replicate's
+            self._prepare(case)
+            self._values = case.values
+        result = run_scene(self._scene, self.spec.seed, case.replicate, self._beds)
+        return result._replace(values=result.values | self._chosen)
+
+    def _prepare(self, case: Case) -> None:
+        spec = self.spec
+        self._scene, self._chosen = spec.base.with_values(case.values), {}
+        if spec.tolerance is not None:
+            estimate = refine(self._scene, spec.tolerance, spec.max_cost, spec.seed)
+            self._scene, self._chosen = estimate.scene, estimate.variables()
+        cost.refuse_too_large(self._scene, self._room)
+
+
+def _room(at_once: int) -> tuple[int, str]:
+    """Return the memory that each of `at_once` cases may count on, and the limit that sets it."""
+    available, limit = cost.available_memory()
+    shared = f"{limit}, shared by {at_once} cases at once," if at_once > 1 else limit
+    return available // at_once, shared
+
+
+def run_case(runner: Runner, case: Case) -> CaseResult:
+    """Simulate one case; whatever happens is told in its result, never raised."""
+    try:
+        result = runner.run(case)
+        whole = _stored(result.values)
+    except ValidationError as error:
+        return CaseResult(case.index, "refused", faults_of(error), {})
+    except (ValueError, MemoryError) as error:
+        return CaseResult(case.index, "refused", str(error), {})
+    except Exception as error:  # a fault in one case must not lose the others
+        return CaseResult(case.index, "failed", f"{type(error).__name__}: {error}", {})
+    known = schema.COORDINATES | schema.VARIABLES
+    summary = {name: value for name, value in whole.items() if not {"point", "cell", "time"} & set(known[name].dims)}
+    broken = [name for name, value in summary.items() if not np.isfinite(value).all()]
+    if broken:
+        return CaseResult(case.index, "failed", f"not finite: {', '.join(broken)}", {})
+    if not runner.spec.whole:
+        return CaseResult(case.index, "ok", "", summary, result.diagnostics)
+    title = "Comminution in high pressure grinding rolls, heterarchical model: one case of a study"
+    attrs = attributes(result, title, runner.spec.seed, case.replicate)
+    return CaseResult(case.index, "ok", "", summary, result.diagnostics, whole, attrs)
+
+
+def _stored(values: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Return the variables of a case as they are stored."""
+    known = schema.COORDINATES | schema.VARIABLES
+    return {name: np.asarray(values[name], known[name].dtype) for name in known if values.get(name) is not None}
+
+
+def run_batch(spec: SweepSpec, cases: list[Case]) -> list[CaseResult]:
+    """Run cases one after the other; this is a task of a worker."""
+    if spec.code and spec.code != code_version():
+        raise OtherCode("a worker's hpgr or libraries differ from the driver's; install the same on both")
+    runner = Runner(spec, threads_here())
+    return [run_case(runner, case) for case in cases]
+
+
+def threads_here() -> int:
+    """Return how many tasks this process may run at once, which share its memory."""
+    from distributed import get_worker
+
+    try:
+        return get_worker().state.nthreads
+    except ValueError:  # no worker
+        return 1
+
+
+# ---- what is left to do
+
+
+class Plan:
+    """What is left to do of a sweep, and where finished cases go."""
+
+    def __init__(self, spec: SweepSpec, space: Space, kept: CaseFolder | None):
+        self.spec, self.space, self.kept = spec, space, kept
+        addresses = Addresses(spec)
+        self.addresses = [addresses.of(case.values, case.replicate) for case in space.cases()]
+        self._numbers = {address: number for number, address in enumerate(self.addresses)}  # of those not yet here
+        self._queue = deque(range(space.total))
+        self._elsewhere: deque[int] = deque()  # what other drivers are computing
+        self._fresh: list[CaseResult] = []  # read back, and not yet told
+        self.batch = 1
+
+    @property
+    def left(self) -> int:
+        """Number of cases without a result."""
+        return len(self._numbers)
+
+    def is_open(self) -> bool:
+        """Return whether there are cases that neither this driver nor the folder has yet."""
+        return bool(self._queue or self._elsewhere)
+
+    def next_batch(self) -> list[Case]:
+        """Return cases to compute, now this driver's; none if there are none to be had now."""
+        if not self._queue:
+            self._queue, self._elsewhere = self._elsewhere, deque()
+        replicates = self.space.replicates
+        batch: list[int] = []
+        while self._queue and len(batch) < self.batch:
+            number = self._queue[0]
+            if batch and self.spec.tolerance is not None and number // replicates != batch[0] // replicates:
+                break  # the replicates of an operating point share its refinement
+            self._queue.popleft()
+            address = self.addresses[number]
+            if address not in self._numbers:  # read back
+                continue
+            if self.kept is None or self.kept.claim(address):
+                batch.append(number)
+            else:
+                self._elsewhere.append(number)
+        self._fresh += self._read()  # what another driver finished before this one claimed it
+        return [self.space.case(number) for number in batch if self.addresses[number] in self._numbers]
+
+    def read_back(self) -> Iterator[CaseResult]:
+        """Yield the results that have come into the folder since the last call."""
+        fresh, self._fresh = self._fresh, []
+        yield from fresh
+        yield from self._read()
+
+    def _read(self) -> Iterator[CaseResult]:
+        if self.kept is None:
+            return
+        for found in self.kept.read(self._numbers.__contains__):
+            number = self._numbers.pop(found.address)
+            self.kept.release(found.address)
+            yield result_of(found.header, found.arrays, self.space.case(number).index)
+
+    def settle(self, result: CaseResult) -> CaseResult:
+        """Keep a computed result if it is well; return it without what has gone to a file."""
+        address = self.addresses[self.space.number(result.index)]
+        self._numbers.pop(address, None)
+        if self.kept is None:
+            return result
+        if result.status != "ok":  # never counts as done
+            self.kept.release(address)
+            return result
+        self.kept.put(address, result)
+        return result._replace(whole=None, attrs=None)
+
+
+def results(plan: Plan, client: Any, threads: int, task: Task, progress: bool) -> Iterator[CaseResult]:
+    """Yield the result of every case: first those read back, then the others as they come in."""
+    yield from plan.read_back()
+    if progress and plan.kept is not None:
+        say(f"{plan.space.total - plan.left} of {plan.space.total} cases read back from {plan.kept.folder}")
+    if not plan.left:
+        return
+    if client is None:
+        with own_client(threads) as own:
+            yield from _computed(plan, own, task, progress)
+    else:
+        yield from _computed(plan, client, task, progress)
+
+
+def _computed(plan: Plan, client: Any, task: Task, progress: bool) -> Iterator[CaseResult]:
+    from studies.command import progress_bar  # late: workers do without a command line
+
+    workers = workers_of(client)
+    plan.batch = _batch_size(plan, workers)
+    total = plan.space.total
+    if progress:
+        say(_prediction(plan, workers))
+    with progress_bar(total, progress, "cases", "{rate_fmt}, {remaining} left", total - plan.left) as bar:
+        for result in dispatched(plan, client, task):
+            yield plan.settle(result)
+            bar.update(total - plan.left - bar.n)
+
+
+def _batch_size(plan: Plan, workers: int) -> int:
+    if plan.spec.whole:  # a case at a time, or the driver's memory would grow with the batch
+        return 1
+    if plan.spec.tolerance is not None:
+        return plan.space.replicates
+    quick = int(_BATCH_SECONDS / cost.predict(plan.spec.base).seconds)
+    return max(1, min(_BATCH, quick, plan.left // (4 * workers)))
+
+
+def _prediction(plan: Plan, workers: int) -> str:
+    """Return in words what the cases that are left are predicted to cost."""
+    replicates = plan.space.replicates
+    points = plan.space.total // replicates
+    costs = []
+    for point in np.unique(np.linspace(0, points - 1, min(points, _PREDICTED)).astype(int)):
+        try:
+            costs.append(cost.predict(plan.spec.base.with_values(plan.space.case(int(point) * replicates).values)))
+        except ValidationError:
+            continue  # refused, which costs nothing
+    seconds = plan.left * sum(each.seconds for each in costs) / max(len(costs), 1) / workers
+    most = max((each.bytes for each in costs), default=0)
+    before = ", before refinement" if plan.spec.tolerance is not None else ""
+    return (
+        f"{plan.left} cases to compute on {workers} thread{'s' * (workers > 1)}: predicted {seconds:.2g} s, "
+        f"at most {most / 1e6:.3g} MB a case{before}"
+    )
+
+
+# ---- dask
+
+
+@contextmanager
+def own_client(threads: int) -> Iterator[Any]:
+    """Start a dask cluster in this process; it listens on loopback only."""
+    from distributed import Client, LocalCluster  # late: importing costs 0.5 s
+
+    # one process: the kernels release the lock; its dashboards would listen on every interface
+    with (
+        LocalCluster(
+            processes=False,
+            n_workers=1,
+            threads_per_worker=threads,
+            dashboard_address="127.0.0.1:0",
+            worker_dashboard_address="127.0.0.1:0",
+            memory_limit=0,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+def workers_of(client: Any) -> int:
+    """Return the threads of the client's workers, at least 1."""
+    return max(1, sum(client.nthreads().values()))
+
+
+def dispatched(plan: Plan, client: Any, task: Task) -> Iterator[CaseResult]:
+    """Yield the result of every case of the plan as it comes in, in no particular order.
+
+    Raises
+    ------
+    ConnectionError
+        If the scheduler is lost.
+    OtherCode
+        If a worker has other code than the driver.
+    """
+    finished: queue.SimpleQueue = queue.SimpleQueue()
+    flying: dict[Any, list[Case]] = {}
+    again: list[list[Case]] = []  # cases of batches that were lost, to be run one by one
+    window = (_AHEAD_WHOLE if plan.spec.whole else _AHEAD) * workers_of(client)
+    idle = _Idle()
+    try:
+        while True:
+            while len(flying) < window:
+                batch = again.pop() if again else plan.next_batch()
+                if not batch:
+                    break
+                future = client.submit(task, plan.spec, batch, pure=False)
+                flying[future] = batch
+                future.add_done_callback(finished.put)
+            yield from plan.read_back()
+            if not flying and not plan.is_open():
+                return
+            try:
+                future = finished.get(timeout=_TICK)
+            except queue.Empty:  # nothing yet, or only other drivers are at work
+                window = max(window, _AHEAD * workers_of(client)) if not plan.spec.whole else window
+                idle.tell(plan, bool(flying))
+                continue
+            batch = flying.pop(future)
+            yield from _settle(future, batch, again)
+            future.release()
+            del future
+    finally:
+        for future in flying:
+            future.cancel()
+
+
+class _Idle:
+    """Tells the user whom a driver without work of its own is waiting for."""
+
+    def __init__(self):
+        self._since, self._patience = time.monotonic(), _PATIENCE
+
+    def tell(self, plan: Plan, busy: bool) -> None:
+        if busy:
+            self._since = time.monotonic()
+        elif time.monotonic() - self._since > self._patience:
+            say(f"waiting for {plan.left} cases that other drivers hold: {plan.kept.others()}")
+            self._patience *= 2
+
+
+def _settle(future: Any, batch: list[Case], again: list[list[Case]]) -> Iterator[CaseResult]:
+    """Yield the results of a batch that has come to an end; if it was lost, its cases are tried one by one."""
+    from distributed import KilledWorker
+
+    if future.status == "finished":
+        yield from future.result()
+        return
+    if future.status != "error":
+        raise ConnectionError(
+            f"lost the dask scheduler ({future.status}); finished cases are kept; run the same command again"
+        )
+    error = future.exception()
+    if isinstance(error, OtherCode):
+        raise error
+    if len(batch) > 1:
+        again.extend([case] for case in reversed(batch))
+        return
+    status = "worker_lost" if isinstance(error, KilledWorker) else "failed"
+    yield CaseResult(batch[0].index, status, f"{type(error).__name__}: {error}", {})

@@ -1,0 +1,230 @@
+"""The command line that the sweeps over gap, speed and feed share."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+
+from pydantic import ValidationError
+
+from hpgr.cost import predict
+from hpgr.fields import faults_of, show, unit_shown
+from hpgr.scene import Scene, field_info
+from studies import command as line
+from studies.command import Report, shown_as
+from studies.sweep.space import AXES, Space, SweepSpec, axis_values
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+class Study(NamedTuple):
+    """One ready sweep: its name, the option of its main axis, default values as multiples, and its message."""
+
+    name: str
+    main: str
+    factors: tuple[float, ...]
+    about: str
+    caption: str
+    exchange_caption: str = ""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of a sweep; quantities are text with a unit, such as "60 mm" or "19 rpm"."""
+
+    gap: Annotated[tuple[str, ...] | None, shown_as("LENGTH ...")] = None
+    """Gaps to sweep, such as --gap "40 mm" "60 mm"."""
+    press_force: Annotated[tuple[str, ...] | None, shown_as("PRESSURE ...")] = None
+    """Specific pressing forces F/(D L) to sweep, such as --press-force "2.5 N/mm^2" "4 N/mm^2"; the gap then floats."""
+    roll_speed: Annotated[tuple[str, ...] | None, shown_as("SPEED ...")] = None
+    """Roll speeds to sweep, such as --roll-speed "15 rpm" "19 rpm"."""
+    feed_top_size: Annotated[tuple[str, ...] | None, shown_as("LENGTH ...")] = None
+    """Top sizes of the feed to sweep, such as --feed-top-size "40 mm" "60 mm"."""
+    scene: line.SceneName = "paper"
+    replicates: line.Replicates = 3
+    level: line.Level = None
+    cells: line.Cells = None
+    points: line.Points = None
+    streamlines: line.Streamlines = None
+    tolerance: Annotated[float | None, shown_as("X")] = None
+    """Relative error wanted, such as 0.01: every operating point is refined until its estimate is below it."""
+    max_cost: Annotated[float, shown_as("SECONDS")] = 60.0
+    """Predicted time that meeting the tolerance may take at an operating point."""
+    sieve: line.Sieve = "1 mm"
+    workers: Annotated[int, shown_as("N")] = 2
+    """Threads of this process to run cases on; without effect beside --scheduler."""
+    scheduler: Annotated[str | None, shown_as("ADDRESS")] = None
+    """Running dask scheduler to use instead, such as tcp://127.0.0.1:8786."""
+    exchange: line.Exchange = False
+    record: Literal["product", "distributions", "cells"] = "product"
+    """What is kept of every case beside its summary: a file of distributions or cells, for studies.open_cases."""
+    timeout: Annotated[float | None, shown_as("SECONDS")] = None
+    """Time that a case may take; cases then run in processes of their own, and one that hangs or dies is named."""
+    recompute: line.Flag = False
+    """Compute every case, also those that are finished already in <out>.cases."""
+    seed: line.Seed = 0
+    out: Annotated[Path | None, shown_as("FILE")] = None
+    """NetCDF file to write (default: outputs/<study>.nc); beside it the figure, .png, and finished cases, .cases."""
+    plot: line.Plot = True
+    overwrite: line.Overwrite = False
+    dry_run: line.Flag = False
+    """List the cases with their predicted memory and time, say which are finished already, and run none."""
+
+
+def sweep_command(study: Study) -> Callable[..., int]:
+    """Return the main function of a ready sweep, as `studies.command.command` makes it."""
+
+    def files(options: Options) -> list[Path]:
+        out = _out(study, options)
+        return [] if options.dry_run else [out, out.with_suffix(".png")][: 1 + options.plot]
+
+    @line.command(study.name, study.about, files)
+    def main(options: Options) -> Report:
+        """Run the study and return its exit code; `arguments` default to the command line's."""
+        return _run(study, options)
+
+    return main
+
+
+def _out(study: Study, options: Options) -> Path:
+    return line.file_of(options.out or Path("outputs") / f"{study.name}.nc")
+
+
+def _run(study: Study, options: Options) -> Report:
+    scene = line.base_scene(options)
+    study = _floating(study, options)
+    axes = _axes(study, options, scene)
+    sieve = _sieve(options, scene)
+    _check(options)
+    folder = _out(study, options).with_suffix(".cases")
+    if options.dry_run:
+        return Report(_cases(scene, Space(axes, options.replicates), options, folder))
+    exchanging = scene.exchange is not None and study.exchange_caption
+    caption = study.exchange_caption if exchanging else study.caption
+    return _report(AXES[study.main], caption, _swept(scene, axes, options, folder), sieve)
+
+
+def _check(options: Options) -> None:
+    if min(options.workers, options.replicates) < 1:
+        raise ValueError(f"got --workers {options.workers} --replicates {options.replicates}; both must be at least 1")
+    if options.timeout is not None and not 0.1 <= options.timeout <= 1e6:
+        raise ValueError(f"--timeout: got {options.timeout:g}; must be 0.1 to 1,000,000 s; such as 60")
+    if options.tolerance is None:
+        return
+    if not 1e-4 <= options.tolerance <= 0.5:
+        raise ValueError(f"--tolerance: got {options.tolerance:g}; must be within 0.0001 to 0.5; such as 0.01")
+    given = [name for name in ("level", "cells", "points") if getattr(options, name) is not None]
+    if given:
+        raise ValueError(
+            f"--{given[0]}: got it beside --tolerance, which chooses points and cells itself; give one of them"
+        )
+
+
+def _floating(study: Study, options: Options) -> Study:
+    """Return a study of the gap as one of the pressing force, if forces are given: the gap then floats."""
+    if study.main != "gap" or options.press_force is None:
+        return study
+    if options.gap is not None:
+        raise ValueError("--gap: got it beside --press-force, under which the gap floats; give one of them")
+    return study._replace(main="press_force", caption="The gap floats under the pressing force; the nip angle is held.")
+
+
+def _axes(study: Study, options: Options, scene: Scene) -> dict[str, list]:
+    """Return the swept fields with their values, the study's own first."""
+    if scene.feed.kind == "single" and (study.main == "feed_top_size" or options.feed_top_size):
+        raise ValueError("--feed-top-size: the scene's feed is of a single size and has no top; sweep another feed")
+    order = [study.main, *(name for name in AXES if name != study.main)]
+    axes = {AXES[name]: getattr(options, name) for name in order if getattr(options, name) is not None}
+    if getattr(options, study.main) is None:
+        axes = {AXES[study.main]: _default_values(study, scene), **axes}
+    return axis_values(axes)
+
+
+def _default_values(study: Study, scene: Scene) -> list[float]:
+    """Return the scene's own value times the study's factors."""
+    section, key = AXES[study.main].split(".")
+    own = getattr(getattr(scene, section), key)
+    if own is None and key == "top_size":
+        own = scene.feed.largest_grain
+    shown = unit_shown(field_info(AXES[study.main]).unit)[1]
+    return [own if factor == 1 else float(f"{own * factor * shown:.3g}") / shown for factor in study.factors]
+
+
+def _sieve(options: Options, scene: Scene) -> float:
+    known = scene.resolution.sieves
+    sieve = line.quantity_of("--sieve", options.sieve, "m")
+    if not known[0] <= sieve <= known[-1]:
+        raise ValueError(
+            f"--sieve: got {options.sieve!r}; must lie within the scene's sieves, "
+            f"{show(known[0], 'm')} to {show(known[-1], 'm')}; such as --sieve '{show(known[-1], 'm')}'"
+        )
+    return sieve
+
+
+def _swept(scene: Scene, axes: dict[str, list], options: Options, folder: Path) -> "xr.Dataset":
+    from studies.sweep import sweep
+
+    names = ("tolerance", "max_cost", "replicates", "seed", "recompute", "timeout", "record")
+    common = {name: getattr(options, name) for name in names} | {"progress": True, "folder": folder}
+    if options.scheduler is None:
+        return sweep(scene, axes, threads=options.workers, **common)
+    from distributed import Client
+
+    with Client(options.scheduler, timeout="10s") as client:
+        return sweep(scene, axes, client=client, **common)
+
+
+def _report(field: str, caption: str, result: "xr.Dataset", sieve: float) -> Report:
+    from studies.show import report
+
+    lost = report.lost_cases(result)
+    if not report.any_result(result):
+        return Report(faults=[*lost, "no case holds a result; nothing was written"])
+    sayings = [*report.change(result, field), caption]
+
+    def drawn() -> Any:
+        from studies.show.plots import sweeps
+
+        return sweeps.sweep_figure(result, field, sieve, "\n".join(sayings))
+
+    lines = [report.table(result, sieve), *report.notes(result), *sayings]
+    return Report(lines, [result, line.figure(drawn)], lost)
+
+
+def _cases(scene: Scene, space: Space, options: Options, folder: Path) -> list[str]:
+    """Return in words what a sweep would run: its operating points, with predicted memory and time."""
+    from studies.show.report import aligned
+    from studies.sweep.cases import code_version, finished
+
+    scene = scene.with_values({"resolution.record": options.record})
+    spec = SweepSpec(scene, options.seed, options.tolerance, options.max_cost, code=code_version())
+    kept = {} if options.recompute else finished(spec, space, folder)
+    headings = [f"{dim.replace('_', ' ')} [{unit_shown(field_info(AXES[dim]).unit)[0]}]" for dim in space.dims[:-1]]
+    rows, seconds = [], 0.0
+    for case in Space(space.grid, 1).cases():
+        shown, time = _row(scene, case.values, space.replicates, kept.get(case.index[:-1], 0))
+        rows.append(shown if kept else shown[:-1])
+        seconds += time
+    lines = [f"{scene}\n", aligned([*headings, "memory", "time", *(["finished"] if kept else [])], rows), ""]
+    if options.tolerance is not None:
+        lines.append(
+            f"before refinement: --tolerance {options.tolerance:g} chooses points and cells when a case is run"
+        )
+    done = f"{sum(kept.values())} of them finished already in {folder}; the others " if kept else ""
+    lines.append(
+        f"{space.total} cases ({space.replicates} replicates each), {done}about {seconds / options.workers:.2g} s on "
+        f"{options.workers} threads, plus start-up"
+    )
+    return lines
+
+
+def _row(scene: Scene, values: dict[str, float], replicates: int, done: int) -> tuple[list[str], float]:
+    """Return the row of an operating point, and the seconds that its unfinished replicates are predicted to take."""
+    place = [show(value, field_info(name).unit) for name, value in values.items()]
+    try:
+        cost = predict(scene.with_values(values))
+    except ValidationError as error:
+        return [*place, "", "", f"refused: {faults_of(error)}"], 0.0
+    figures = [f"{cost.bytes / 1e6:.1f} MB", f"{cost.seconds * 1e3:.1f} ms", f"{done} of {replicates}"]
+    return [*place, *figures], cost.seconds * (replicates - done)
