@@ -1,0 +1,1 @@
+"""From a loaded bed to a crushed feed."""
