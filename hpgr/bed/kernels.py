@@ -1,11 +1,12 @@
 """The bed, compiled, and the only one there is: points, strains, stresses, wall force and power of every streamline.
 
-Streamlines do not know of each other. Arrays are (streamline, point), entry to exit; `bed` is a
-`hpgr.bed.geometry.Geometry`, `flow` and `elastic` are the constants of a law. A law has one branch, on its tag: a
+Streamlines do not know of each other. Arrays are (streamline, point), or (point,) of one line, entry to exit; `bed` is
+a `hpgr.bed.geometry.Geometry`, `flow` and `elastic` are the constants of a law. A law has one branch, on its tag: a
 speed profile in `_descent`, an elastic law in `_response`. The tests hold each against its law's NumPy equation.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -20,220 +21,231 @@ _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 _TENSION_NOISE = 1e-9  # of the largest stress; less is rounding of the running sum
 
 
+class Line(NamedTuple):
+    """The streamline x = xi X(y) of a bed, and the height of the nip, of the bed where there is none."""
+
+    half_gap: float
+    height: float
+    b: float
+    c: float
+    nip: float
+    xi: float
+
+
+class Table(NamedTuple):
+    """Panels of a streamline: the places between them, exit to entry, the times to there from the exit, slowness."""
+
+    places: np.ndarray
+    times: np.ndarray
+    slowness: np.ndarray
+
+
 # --- motion -------------------------------------------------------------------------------------------------
 
 
 @_compiled
-def nip_height(bed, flow):
-    """Return the height above which the bed is not compacted by construction, R sin(alpha), m; the bed's if none."""
-    return min(bed.radius * math.sin(flow.nip_angle), bed.height) if flow.nip_angle > 0 else bed.height
+def line_of(bed, flow, xi):
+    """Return a streamline; the nip is at the height R sin(alpha)."""
+    nip = min(bed.radius * math.sin(flow.nip_angle), bed.height) if flow.nip_angle > 0 else bed.height
+    return Line(bed.half_gap, bed.height, bed.b, bed.c, nip, xi)
 
 
 @_compiled
-def _shape(bed, y):
-    """Return half width X of the bed, m, X' and X'', 1/m."""
-    return (
-        bed.half_gap + y * y * (bed.b + bed.c * y),
-        y * (2 * bed.b + 3 * bed.c * y),
-        2 * bed.b + 6 * bed.c * y,
-    )
+def _shape(line, y):
+    """Return the half width X of the bed, m, X' and X'', 1/m."""
+    outer = line.half_gap + y * y * (line.b + line.c * y)
+    return outer, y * (2 * line.b + 3 * line.c * y), 2 * line.b + 6 * line.c * y
 
 
 @_compiled
-def _descent(bed, flow, nip, xi, y, depth):
-    """Return |v| and |v_y| over U on the streamline xi, and the derivatives of |v_y| / U by xi and, on it, by y."""
-    outer, slope, curvature = _shape(bed, y)
-    t = xi * slope
+def _descent(line, flow, y, depth):
+    """Return |v| and |v_y| over U, and the derivatives of the latter by xi and, along the streamline, by y."""
+    outer, slope, curvature = _shape(line, y)
+    t = line.xi * slope
     steep = 1 + t * t
-    if flow.law == NIP and y > nip:  # the bed keeps its density: |v_y| = g(xi) X_n / X
-        nip_outer, nip_slope, _ = _shape(bed, nip)
-        nip_t = xi * nip_slope
+    if flow.law == NIP and y > line.nip:  # the bed keeps its density: |v_y| = g_n(xi) X_n / X
+        nip_outer, nip_slope, _ = _shape(line, line.nip)
+        nip_t = line.xi * nip_slope
         g, wide = 1 / math.sqrt(1 + nip_t * nip_t), nip_outer / outer
-        speed = math.sqrt(steep / (1 + nip_t * nip_t)) * nip_outer / outer
-        return speed, wide * g, -wide * nip_t * nip_slope * g * g * g, -wide * g * slope / outer
+        return math.sqrt(steep) * g * wide, wide * g, -wide * nip_t * nip_slope * g * g * g, -wide * g * slope / outer
     g = 1 / math.sqrt(steep)
     speed, by_y = 1.0, 0.0
     if flow.law == POWER:
-        speed = depth if flow.exponent == 1.0 else depth**flow.exponent
-        by_y = -flow.exponent * (1.0 if flow.exponent == 1.0 else speed / depth) / bed.height
+        linear = flow.exponent == 1.0
+        speed = depth if linear else depth**flow.exponent
+        by_y = -flow.exponent * (1.0 if linear else speed / depth) / line.height
     turn = speed * t * g * g * g
-    return speed, speed * g, -turn * slope, by_y * g - turn * xi * curvature
+    return speed, speed * g, -turn * slope, by_y * g - turn * line.xi * curvature
 
 
 @_compiled
-def _gradient(bed, flow, nip, xi, y, depth):
+def gradient(line, flow, y, depth):
     """Return |v| / U and the velocity gradient in U/H: v_xx, v_xy, v_yx, v_yy, where v_xy is the change of v_x by y.
 
-    The velocity follows the streamline x = xi X(y); its direction varies with x at fixed y because xi does.
+    The velocity follows the streamline; its direction varies with x at fixed y because xi does.
     """
-    speed, fall, by_xi, by_y = _descent(bed, flow, nip, xi, y, depth)
-    outer, slope, curvature = _shape(bed, y)
-    t, v_y = xi * slope, -bed.height * fall
-    v_yx = -bed.height * by_xi / outer
-    v_yy = -bed.height * (by_y - by_xi * t / outer)
-    t_x, t_y = slope / outer, xi * (curvature - slope * slope / outer)
+    speed, fall, by_xi, by_y = _descent(line, flow, y, depth)
+    outer, slope, curvature = _shape(line, y)
+    t, v_y = line.xi * slope, -line.height * fall
+    v_yx = -line.height * by_xi / outer
+    v_yy = -line.height * (by_y - by_xi * t / outer)
+    t_x, t_y = slope / outer, line.xi * (curvature - slope * slope / outer)
     return speed, t_x * v_y + t * v_yx, t_y * v_y + t * v_yy, v_yx, v_yy
 
 
 @_compiled
-def _deviator(v_xx, v_xy, v_yx, v_yy):
-    """Return xx, yy, zz and xy of the strain rate's deviator, and the triaxial shear rate sqrt(2/3 e':e')."""
+def deviator(v_xx, v_xy, v_yx, v_yy):
+    """Return xx, yy and xy of the strain rate's deviator in plane strain, and the shear rate sqrt(2/3 e':e')."""
     third = (v_xx + v_yy) / 3
-    xx, yy, zz, xy = v_xx - third, v_yy - third, -third, (v_xy + v_yx) / 2
-    return xx, yy, zz, xy, math.sqrt(2 / 3 * (xx * xx + yy * yy + zz * zz + 2 * xy * xy))
+    xx, yy, xy = v_xx - third, v_yy - third, (v_xy + v_yx) / 2
+    return xx, yy, xy, math.sqrt(2 / 3 * (xx * xx + yy * yy + third * third + 2 * xy * xy))
 
 
 @_compiled
-def rates(bed, flow, nip, xi, y, depth):
-    """Return |v| / U, volumetric (compaction positive) and triaxial shear strain rate, in U/H."""
-    speed, v_xx, v_xy, v_yx, v_yy = _gradient(bed, flow, nip, xi, y, depth)
-    _, _, _, _, shear = _deviator(v_xx, v_xy, v_yx, v_yy)
-    gripped = flow.nip_angle == 0 or y <= nip
-    return speed, -(v_xx + v_yy) if gripped else 0.0, shear  # 0 by construction; what is left is rounding
+def _rates(line, flow, y, depth):
+    """Return |v| / U, volumetric (compaction positive) and triaxial shear strain rate in U/H."""
+    speed, v_xx, v_xy, v_yx, v_yy = gradient(line, flow, y, depth)
+    _, _, _, shear = deviator(v_xx, v_xy, v_yx, v_yy)
+    # above a nip 0 by construction: what is left is rounding
+    return speed, 0.0 if flow.nip_angle > 0 and y > line.nip else -(v_xx + v_yy), shear
 
 
 @_compiled
-def _at(bed, flow, place):
+def _at(line, flow, place):
     """Return height and depth fraction of a place on the way up from the exit.
 
-    Past a nip places are y/H. Above a stagnant entry they are -log(depth), which stays exact however close the
+    Towards a nip places are y/H. Below a stagnant entry they are -log(depth), which stays exact however close the
     first point comes to it.
     """
     if flow.nip_angle > 0:
-        return bed.height * place, 1 - place
-    return -bed.height * math.expm1(-place), math.exp(-place)
+        return line.height * place, 1 - place
+    return -line.height * math.expm1(-place), math.exp(-place)
 
 
 @_compiled
-def _slowness(bed, flow, nip, xi, place):
-    """Return the time a place takes to cross, in H/U."""
-    y, depth = _at(bed, flow, place)
-    _, fall, _, _ = _descent(bed, flow, nip, xi, y, depth)
-    return 1 / fall if flow.nip_angle > 0 else depth / fall
+def _slowness(line, flow, place):
+    """Return the time it takes to cross a place, in H/U."""
+    y, depth = _at(line, flow, place)
+    _, fall, _, _ = _descent(line, flow, y, depth)
+    return (1.0 if flow.nip_angle > 0 else depth) / fall
 
 
 @_compiled
-def _travel(bed, flow, nip, xi, start, length):
-    """Return the travel time from the place `start` on, by Gauss quadrature, in H/U."""
+def _travel(line, flow, start, length):
+    """Return the travel time down from the place start + length to `start`, by Gauss quadrature, in H/U."""
     total = 0.0
     for k in range(_NODES.size):
-        total += _WEIGHTS[k] * _slowness(bed, flow, nip, xi, start + length * _NODES[k])
+        total += _WEIGHTS[k] * _slowness(line, flow, start + length * _NODES[k])
     return length * total
 
 
 @_compiled
-def _edges(bed, flow, nip):
-    """Return the places between panels, exit to entry; panels end at the nip, where the speed has a kink."""
-    edges = np.empty(_PANELS + 1)
-    if flow.nip_angle == 0:
-        step = -math.log(flow.entry_fraction) / _PANELS
-        for k in range(_PANELS + 1):
-            edges[k] = k * step
-        return edges
+def _cut(line, flow):
+    """Return a table with the places between panels, which end at the nip, where the speed has a kink."""
+    places, half = np.empty(_PANELS + 1), _PANELS // 2
     # high enough, on the mid-plane, that in the same time no tube begins below the nip, already compacted
-    _, slope, _ = _shape(bed, nip)
-    top = max(bed.height * (1 - flow.entry_fraction), nip * math.sqrt(1 + slope * slope))
-    half = _PANELS // 2
-    for k in range(half + 1):
-        edges[k] = k * (nip / half) / bed.height
-        edges[half + k] = (nip + k * ((top - nip) / half)) / bed.height
-    return edges
+    _, slope, _ = _shape(line, line.nip)
+    top = max(line.height * (1 - flow.entry_fraction), line.nip * math.sqrt(1 + slope * slope))
+    for k in range(_PANELS + 1):
+        if flow.nip_angle == 0:
+            places[k] = k * (-math.log(flow.entry_fraction) / _PANELS)
+        elif k <= half:
+            places[k] = k * (line.nip / half) / line.height
+        else:
+            places[k] = (line.nip + (k - half) * ((top - line.nip) / half)) / line.height
+    return Table(places, np.empty(_PANELS + 1), np.empty(_PANELS + 1))
 
 
 @_compiled
-def _tabulate(bed, flow, nip, xi, edges, times):
-    """Fill `times` with the travel times from the exit to each of the panels' edges; return the last, in H/U."""
-    times[0] = 0.0
-    for k in range(_PANELS):
-        times[k + 1] = times[k] + _travel(bed, flow, nip, xi, edges[k], edges[k + 1] - edges[k])
-    return times[_PANELS]
+def _tabulate(line, flow, table):
+    """Fill the times and slownesses of a streamline; return the travel time from the highest place, in H/U."""
+    places, total = table.places, 0.0
+    for k in range(_PANELS + 1):
+        table.slowness[k] = _slowness(line, flow, places[k])
+        if k > 0:
+            total += _travel(line, flow, places[k - 1], places[k] - places[k - 1])
+        table.times[k] = total
+    return total
 
 
 @_compiled
-def _march_back(bed, flow, nip, xi, edges, times, duration, places):
+def _march_back(line, flow, table, duration, places):
     """Fill the places of a streamline's points, equal times apart, by Newton's method inside their panels."""
     last, panel = places.size - 1, 0
     for j in range(last, -1, -1):
         wanted = duration * ((last - j) / last)
-        while panel < _PANELS - 1 and times[panel + 1] <= wanted:
+        while panel < _PANELS - 1 and table.times[panel + 1] <= wanted:
             panel += 1
-        start, left = edges[panel], wanted - times[panel]
-        # the linear guess is within 1e-2 of a panel; each pass squares the error
-        panel_time = times[panel + 1] - times[panel]
-        length = (edges[panel + 1] - start) * left / panel_time
+        start, left = table.places[panel], wanted - table.times[panel]
+        width, time = table.places[panel + 1] - start, table.times[panel + 1] - table.times[panel]
+        # the cubic through the panel's ends with their slopes is 1e-6 off; each pass squares that
+        u, low, high = left / time, time / table.slowness[panel] - width, time / table.slowness[panel + 1] - width
+        length = u * (width + (1 - u) * (low * (1 - u) - high * u))
         for _ in range(4):
-            miss = _travel(bed, flow, nip, xi, start, length) - left
-            length -= miss / _slowness(bed, flow, nip, xi, start + length)
-            if abs(miss) <= 1e-8 * panel_time:
+            miss = _travel(line, flow, start, length) - left
+            length -= miss / _slowness(line, flow, start + length)
+            if abs(miss) <= 1e-7 * time:
                 break
         places[j] = start + length
 
 
 @_compiled
-def _past_nip(bed, xi, nip, y, way):
+def _past_nip(line, y, way):
     """Return how much of the step that crosses the nip and ends at the height y, `way` long, lies past the nip."""
     # there |v| = U, so time is arc length over U; the chord of a step is 1e-6 short of its arc
-    outer, _, _ = _shape(bed, y)
-    nip_outer, _, _ = _shape(bed, nip)
-    return min(math.hypot(xi * outer - xi * nip_outer, y - nip) / way, 1.0) if y < nip else 0.0
+    outer, _, _ = _shape(line, y)
+    nip_outer, _, _ = _shape(line, line.nip)
+    return min(math.hypot(line.xi * outer - line.xi * nip_outer, y - line.nip) / way, 1.0) if y < line.nip else 0.0
 
 
 @_compiled
-def _strain(bed, flow, nip, xi, surface_speed, time_step, y, volumetric_rate, shear_rate, volumetric, shear):
-    """Fill the strains of the step that ends at each point of a streamline, by the trapezoid rule.
+def _strain(line, flow, surface_speed, time_step, y, volumetric_rate, shear_rate, volumetric, shear):
+    """Fill the strains of the step that ends at each point, by the trapezoid rule.
 
     They count from the onset of compaction: the first point that compacts, or the nip. Of the step with the nip only
     what lies past it counts, with the rates just past it.
     """
     volumetric[0] = shear[0] = 0.0
-    begun = False
+    begun = flow.nip_angle > 0
     for j in range(1, y.size):
-        begun = begun or volumetric_rate[j - 1] > 0 or flow.nip_angle > 0
+        begun = begun or volumetric_rate[j - 1] > 0
         past = time_step / 2 if begun else 0.0
         first_volumetric, first_shear = volumetric_rate[j - 1], shear_rate[j - 1]
-        if flow.nip_angle > 0 and y[j - 1] > nip:
-            past *= _past_nip(bed, xi, nip, y[j], surface_speed * time_step)
-            _, first_volumetric, first_shear = rates(bed, flow, nip, xi, nip, 1 - nip / bed.height)
-            first_volumetric /= bed.height / surface_speed
-            first_shear /= bed.height / surface_speed
+        if flow.nip_angle > 0 and y[j - 1] > line.nip:
+            past *= _past_nip(line, y[j], surface_speed * time_step)
+            _, first_volumetric, first_shear = _rates(line, flow, line.nip, 1 - line.nip / line.height)
+            first_volumetric /= line.height / surface_speed
+            first_shear /= line.height / surface_speed
         volumetric[j] = (volumetric_rate[j] + first_volumetric) * past
         shear[j] = (shear_rate[j] + first_shear) * past
 
 
 @_compiled
 def lay(bed, flow, surface_speed, y, speed, volumetric_rate, shear_rate, volumetric, shear):
-    """Lay the material points; return the time step, s.
+    """Lay the material points; return the time step, s, and the closest that neighbours come in height, m.
 
     Fills heights, m, speeds, m/s, and strain rates, 1/s, of the points, and the strains of the step that ends at each.
     """
     lines, points = y.shape
-    nip, unit_time = nip_height(bed, flow), bed.height / surface_speed
-    edges, times, places = _edges(bed, flow, nip), np.empty(_PANELS + 1), np.empty(points)
-    duration = _tabulate(bed, flow, nip, 0.0, edges, times)
-    time_step = duration * unit_time / (points - 1)
+    middle = line_of(bed, flow, 0.0)
+    table, places, unit_time = _cut(middle, flow), np.empty(points), bed.height / surface_speed
+    duration = _tabulate(middle, flow, table)
+    time_step, closest = duration * unit_time / (points - 1), math.inf
     for i in range(lines):
-        _tabulate(bed, flow, nip, bed.xi[i], edges, times)
-        _march_back(bed, flow, nip, bed.xi[i], edges, times, duration, places)
+        line = line_of(bed, flow, bed.xi[i])
+        _tabulate(line, flow, table)
+        _march_back(line, flow, table, duration, places)
         for j in range(points):
-            y[i, j], depth = _at(bed, flow, places[j])
-            relative, volumetric_rate[i, j], shear_rate[i, j] = rates(bed, flow, nip, bed.xi[i], y[i, j], depth)
+            y[i, j], depth = _at(line, flow, places[j])
+            relative, volumetric_rate[i, j], shear_rate[i, j] = _rates(line, flow, y[i, j], depth)
             speed[i, j] = surface_speed * relative
             volumetric_rate[i, j] /= unit_time
             shear_rate[i, j] /= unit_time
-        _strain(
-            bed,
-            flow,
-            nip,
-            bed.xi[i],
-            surface_speed,
-            time_step,
-            y[i],
-            volumetric_rate[i],
-            shear_rate[i],
-            volumetric[i],
-            shear[i],
-        )
-    return time_step
+            if j > 0:
+                closest = min(closest, y[i, j - 1] - y[i, j])
+        rates = volumetric_rate[i], shear_rate[i]
+        _strain(line, flow, surface_speed, time_step, y[i], rates[0], rates[1], volumetric[i], shear[i])
+    return time_step, closest
 
 
 # --- stress -------------------------------------------------------------------------------------------------
@@ -347,14 +359,14 @@ def load(elastic, feed_solid_fraction, max_solid_fraction, time_step, volumetric
 
 
 @_compiled
-def across(bed, flow, nip, y):
-    """Return n.(-e').n over the shear strain rate on the roll's streamline, n its normal: 1 in uniaxial compaction.
+def across(line, flow, y):
+    """Return n.(-e').n over the shear strain rate on the roll's line, n its normal: 1 in uniaxial compaction.
 
     With stress and strain rate coaxial the normal stress there is p + 2 q / 3 times this.
     """
-    _, v_xx, v_xy, v_yx, v_yy = _gradient(bed, flow, nip, 1.0, y, 1 - y / bed.height)
-    xx, yy, _, xy, shear = _deviator(v_xx, v_xy, v_yx, v_yy)
-    _, slope, _ = _shape(bed, y)
+    _, v_xx, v_xy, v_yx, v_yy = gradient(line, flow, y, 1 - y / line.height)
+    xx, yy, xy, shear = deviator(v_xx, v_xy, v_yx, v_yy)
+    _, slope, _ = _shape(line, y)
     normal = (xx - 2 * slope * xy + slope * slope * yy) / (1 + slope * slope)
     return -normal / shear if shear > 0 else 0.0
 
@@ -362,10 +374,12 @@ def across(bed, flow, nip, y):
 @_compiled
 def wall_force(bed, flow, y, p, q):
     """Return the integral of the normal stress over the height of the roll's streamline (point,), N/m."""
-    nip = nip_height(bed, flow)
+    line = line_of(bed, flow, 1.0)
     force = old_normal = old_y = 0.0
     for j in range(y.size):
-        normal, height = p[j] + 2 / 3 * q[j] * across(bed, flow, nip, y[j]), min(y[j], nip)
+        normal, height = p[j], min(y[j], line.nip)
+        if q[j] > 0:
+            normal += 2 / 3 * q[j] * across(line, flow, y[j])
         if j > 0:
             force += (old_y - height) * (normal + old_normal) / 2
         old_normal, old_y = normal, height
@@ -373,7 +387,7 @@ def wall_force(bed, flow, y, p, q):
 
 
 @_compiled
-def power(bed, y, speed, volumetric, shear, p, q):
+def power(bed, flow, y, speed, volumetric, shear, p, q):
     """Return the work of stress on the compacting bed, both halves of the gap, W/m; the last streamline is the roll's.
 
     Of the mid-plane's side the area between two points is X |v_y| dt / N.
@@ -381,24 +395,13 @@ def power(bed, y, speed, volumetric, shear, p, q):
     tubes = y.shape[0] - 1
     total = 0.0
     for i in range(tubes):
-        old_flux = 0.0
+        line, old_flux = line_of(bed, flow, bed.xi[i]), 0.0
         for j in range(y.shape[1]):
-            outer, slope, _ = _shape(bed, y[i, j])
-            t = bed.xi[i] * slope
+            outer, slope, _ = _shape(line, y[i, j])
+            t = line.xi * slope
             flux = outer * speed[i, j] / math.sqrt(1 + t * t)
             if volumetric[i, j] > 0:
                 work = (p[i, j] + p[i, j - 1]) / 2 * volumetric[i, j] + (q[i, j] + q[i, j - 1]) / 2 * shear[i, j]
                 total += (flux + old_flux) / 2 * work
             old_flux = flux
     return 2 / tubes * total
-
-
-@_compiled
-def force_at_roll(bed, flow, elastic, feed_solid_fraction, max_solid_fraction, surface_speed, points):
-    """Return the force on a bed whose only streamline is the roll's, N/m: all that a floating gap asks for."""
-    work, limited = np.empty((11, 1, points)), np.empty((1, points), np.bool_)
-    y, volumetric_rate, volumetric, shear, p, q = work[0], work[1], work[2], work[3], work[4], work[5]
-    time_step = lay(bed, flow, surface_speed, y, work[6], volumetric_rate, work[7], volumetric, shear)
-    state = work[8], work[9], work[10], p, q, limited
-    load(elastic, feed_solid_fraction, max_solid_fraction, time_step, volumetric_rate, volumetric, shear, state)
-    return wall_force(bed, flow, y[0], p[0], q[0])

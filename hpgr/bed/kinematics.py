@@ -56,8 +56,8 @@ def move(geometry: Geometry, flow: FlowConstants, surface_speed: float, points: 
     time_step = 0.0
     if geometry.height > 0:
         rates = volumetric_rate, shear_rate
-        time_step = kernels.lay(geometry, flow, surface_speed, y, speed, *rates, volumetric, shear)
-        _refuse_coinciding(y, geometry.height, flow.entry_fraction)
+        time_step, closest = kernels.lay(geometry, flow, surface_speed, y, speed, *rates, volumetric, shear)
+        _refuse_coinciding(closest / geometry.height, points, flow.entry_fraction)
     else:  # gap = entry gap: no bed to compact; every point is the exit
         speed += surface_speed
     steps = np.arange(points) / (points - 1)
@@ -73,11 +73,10 @@ def move(geometry: Geometry, flow: FlowConstants, surface_speed: float, points: 
     return kinematics, StepStrains(volumetric, shear)
 
 
-def _refuse_coinciding(y: np.ndarray, height: float, entry_fraction: float) -> None:
-    spacing = float(np.min(y[:, :-1] - y[:, 1:])) / height
+def _refuse_coinciding(spacing: float, points: int, entry_fraction: float) -> None:
     if not spacing >= _CLOSEST:
         raise ValueError(
-            f"flow.entry_fraction: got {entry_fraction:g} with {y.shape[1]} points and substeps; neighbouring material "
+            f"flow.entry_fraction: got {entry_fraction:g} with {points} points and substeps; neighbouring material "
             f"points would be {spacing:.1e} of the bed's height apart, must be at least {_CLOSEST:g}; "
             "raise flow.entry_fraction or use fewer points"
         )

@@ -145,7 +145,7 @@ def _press(walled: Geometry, flow: FlowConstants, motion: Kinematics, strains: S
     onset = flow.nip_angle or math.asin(motion.y[-1, max(int(compacting.argmax()) - 1, 0)] / walled.radius)
     return Pressed(
         kernels.wall_force(walled, flow, motion.y[-1], pressure[-1], shear_stress[-1]),
-        kernels.power(walled, motion.y, motion.speed, *strains, pressure, shear_stress),
+        kernels.power(walled, flow, motion.y, motion.speed, *strains, pressure, shear_stress),
         onset if compacting.any() else 0.0,
     )
 

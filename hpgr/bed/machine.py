@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hpgr.bed import kernels
+from hpgr.bed import kernels, kinematics, stress
 from hpgr.bed.loaded import BedInputs, Pressed, inputs_of
 from hpgr.fields import show
 from hpgr.scene import LEAST_GAP, STEEPEST_ENTRY, Scene
@@ -119,7 +119,10 @@ def _force_over_diameter(inputs: BedInputs) -> float:
     roll = inputs.between_rolls(np.ones(1))
     if roll.height == 0:
         return 0.0
-    return kernels.force_at_roll(roll, *inputs.laws(), inputs.surface_speed, inputs.stress_points) / inputs.diameter
+    flow, *elastic = inputs.laws()
+    motion, strains = kinematics.move(roll, flow, inputs.surface_speed, inputs.stress_points)
+    state = stress.load(*elastic, motion, strains)
+    return kernels.wall_force(roll, flow, motion.y[0], state.pressure[0], state.shear_stress[0]) / inputs.diameter
 
 
 def operating_gap(scene: Scene, specific_pressing_force: float | str) -> float:
