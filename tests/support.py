@@ -1,12 +1,17 @@
 """What several test files share: scenes of small size, lines of cells, and one call of the crushing kernel."""
 
-import inspect
 import math
+from types import SimpleNamespace
 
 import numba
 import numpy as np
 
-from hpgr import feed, kernels, presets, solve
+from hpgr import presets
+from hpgr.grains import kernels, solve
+from hpgr.grains.kernels import Path, Record
+from hpgr.grains.march import ore
+from hpgr.laws.fragments import Fragments
+from hpgr.laws.strength import Strength
 
 SCENE_TOML = """
 [rolls]
@@ -46,12 +51,6 @@ def paper(values=None):
     return presets.paper().with_values(small | (values or {}))
 
 
-def feed_values(**fields):
-    """Return values for `with_values` that replace the paper's uniform feed."""
-    names = ("kind", "bottom_size", "top_size", "size", "exponent", "table")
-    return {f"feed.{name}": fields.get(name) for name in names}
-
-
 def line(cells, seed=0, low=0.008, high=0.06):
     """Return sizes and streams of a line of cells, sizes uniform in the log."""
     generator = np.random.default_rng(seed)
@@ -60,38 +59,39 @@ def line(cells, seed=0, low=0.008, high=0.06):
 
 
 def streams(cells, seed=0):
-    found = np.empty(cells, np.uint64)
-    kernels.start_streams(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0], found)
-    return found
+    """Return independent streams of cells."""
+    base = int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0])
+    return np.array([split_mix(base + (p + 1) * GOLDEN) for p in range(cells)], np.uint64)
 
 
-def march(
-    sizes, streams, log_stress, w=3.04, n=1.0, gamma=1.0, strength_size=0.06, floor=1e-6, sieves=(), every=False,
-    kernel=kernels.march,
-):  # fmt: skip
+def laws(w=3.04, n=1.0, gamma=1.0, reference_size=0.06, floor=1e-6):
+    """Return the laws of strength and fragments by the symbols of their constants."""
+    strength = Strength(weibull_modulus=w, cushioning=n, reference_size=reference_size)
+    return SimpleNamespace(strength=strength, fragments=Fragments(exponent=gamma, size_floor=floor))
+
+
+def march(sizes, streams, log_stress, sieves=(), every=False, kernel=kernels.march, **constants):
     """March copies of a line through a stress history.
 
     Returns
     -------
     (sizes, streams, breaks), and with `every` also (sizes, classes) after every step.
     """
-    sizes, streams, log_stress = sizes.copy(), streams.copy(), np.asarray(log_stress, float)
-    sieves = np.asarray(sieves, float)
-    slope = 3 / w
-    with np.errstate(over="ignore"):
-        reach_needed = np.exp(-log_stress / (slope or 1.0))
-    snapshots = np.empty((log_stress.size, sizes.size) if every else (0, 0), np.float32)
-    classes = np.empty((log_stress.size, sieves.size + 1) if every and sieves.size else (0, 0), np.int64)
-    breaks = kernel(
-        sizes, streams, log_stress, reach_needed, sieves, snapshots, classes,
-        slope, 1 / (2 * n * n), 1 / gamma, strength_size, floor,
-    )  # fmt: skip
-    return (sizes, streams, breaks, snapshots, classes) if every else (sizes, streams, breaks)
+    given, log_stress = laws(**constants), np.asarray(log_stress, float)
+    padded = [np.pad(part, 1)[None] for part in (sizes, streams)]
+    sieves, steps = np.asarray(sieves, float), log_stress.size
+    snapshots = np.empty((1, steps, sizes.size) if every else (0, 0, 0), np.float32)
+    classes = np.empty((1, steps, sieves.size + 1) if every and sieves.size else (0, 0, 0), np.int64)
+    path = Path(log_stress[None], given.strength.critical_size_ratio(log_stress)[None])
+    breaks = np.empty(1, np.int64)
+    kernel(*padded, np.zeros(1, int), path, ore(given), Record(sieves, snapshots, classes), breaks)
+    found = padded[0][0, 1:-1], padded[1][0, 1:-1], int(breaks[0])
+    return (*found, snapshots.reshape(-1, sizes.size), classes.reshape(-1, sieves.size + 1)) if every else found
 
 
-def critical_log_stress(critical, w=3.04, strength_size=0.06):
+def critical_log_stress(critical, w=3.04, reference_size=0.06):
     """Return log(sigma_a / sigma_m) at which grains of size `critical` just break without cushioning."""
-    return -(3 / w) * math.log(critical / strength_size)
+    return -(3 / w) * math.log(critical / reference_size)
 
 
 def ks_distance(sample, distribution):
@@ -102,17 +102,15 @@ def ks_distance(sample, distribution):
     return max(np.max(count[1:] - exact), np.max(exact - count[:-1]))
 
 
+def under(stress, time_step=1.0):
+    """Return as much of a loaded bed as the grains see, compacting everywhere under a stress (streamline, point), Pa."""
+    kinematics = SimpleNamespace(volumetric_rate=np.ones_like(stress), time_step=time_step)
+    return SimpleNamespace(kinematics=kinematics, stress=SimpleNamespace(pressure=stress, shear_stress=0 * stress))
+
+
 def crush(scene, stress, seed=0, replicate=0):
-    """Crush a scene without exchange under a given stress (streamline, point)."""
-    known = {"scene": scene, "stress": stress, "seed": seed, "replicate": replicate}
-    return solve.crush(**{name: known.get(name) for name in inspect.signature(solve.crush).parameters})
-
-
-def draw(given_feed, cells, source):
-    """Sizes of a parcel as the package draws them, from a SeedSequence."""
-    uniforms = np.empty(cells)
-    kernels.stratify(source.generate_state(2, np.uint64)[1], uniforms)
-    return feed.quantile(given_feed, uniforms).astype(np.float32)
+    """Crush a scene without exchange under a given stress (streamline, point), Pa."""
+    return solve.crush(scene, under(stress), seed, replicate)
 
 
 def first_cells(scene, seed, key):
@@ -130,7 +128,7 @@ def first_cells(scene, seed, key):
         q = int(next(numbers) * 2.0**-52 * (p + 1))
         order[p], order[q] = order[q], order[p]
     uniforms = np.array([(stratum + next(numbers) * 2.0**-52) / cells for stratum in order])
-    sizes = feed.quantile(scene.feed, uniforms).astype(np.float32)
+    sizes = scene.feed.quantile(uniforms).astype(np.float32)
     return np.maximum(sizes, np.float32(kernels.SMALLEST)), np.array(streams, np.uint64)
 
 
