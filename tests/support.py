@@ -103,7 +103,7 @@ def ks_distance(sample, distribution):
 
 
 def under(stress, time_step=1.0):
-    """Return as much of a loaded bed as the grains see, compacting everywhere under a stress (streamline, point), Pa."""
+    """Return as much of a loaded bed as the grains see, compacting everywhere under a stress in Pa."""
     kinematics = SimpleNamespace(volumetric_rate=np.ones_like(stress), time_step=time_step)
     return SimpleNamespace(kinematics=kinematics, stress=SimpleNamespace(pressure=stress, shear_stress=0 * stress))
 
@@ -111,6 +111,13 @@ def under(stress, time_step=1.0):
 def crush(scene, stress, seed=0, replicate=0):
     """Crush a scene without exchange under a given stress (streamline, point), Pa."""
     return solve.crush(scene, under(stress), seed, replicate)
+
+
+def draw(feed, cells, source):
+    """Sizes of a parcel as the package draws them, from a SeedSequence."""
+    uniforms = np.empty((1, cells))
+    kernels.start_parcels(source.generate_state(2, np.uint64)[None], uniforms, np.empty((1, cells + 2), np.uint64))
+    return feed.quantile(uniforms[0]).astype(np.float32)
 
 
 def first_cells(scene, seed, key):

@@ -409,7 +409,7 @@ def _break(sizes, streams, places, found, ore):
         state = streams[p] + _GOLDEN
         streams[p] = state
         ratio = uniform(state)
-        if ore.inverse_exponent != 1.0:
+        if ore.fragments == POWER_LAW and ore.inverse_exponent != 1.0:
             ratio **= ore.inverse_exponent
         sizes[p] = np.float32(max(sizes[p] * ratio, SMALLEST))
     _close(sizes)

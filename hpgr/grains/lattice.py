@@ -1,4 +1,4 @@
-"""With exchange: the whole lattice in motion. Each time step all parcels shift by one point, are crushed, swap cells."""
+"""With exchange: the whole lattice in motion. Each step all parcels shift by one point, are crushed, and swap cells."""
 
 from typing import NamedTuple
 
