@@ -14,14 +14,6 @@ from hpgr.bed.loaded import BedInputs, Pressed, inputs_of
 from hpgr.fields import show
 from hpgr.scene import LEAST_GAP, STEEPEST_ENTRY, Scene
 
-# Usual machines and operation (design figures of makers, as collected in the mission of this package; phi ours)
-USUAL = {
-    "roll diameter": (0.5, 2.8, "m"),
-    "specific pressing force": (1e6, 9e6, "Pa"),
-    "specific energy": (3600.0, 10800.0, "J kg-1"),
-    "gap over diameter": (0.02, 0.03, "1"),
-    "exit solid fraction": (0.75, 0.92, "1"),
-}
 _NARROWEST = 1e-4  # gap over diameter below which no operating gap is looked for
 _GAP_PRECISION = 1e-9  # relative, of an operating gap
 _NO_FORCE = 1e-6  # of the wanted force; less counts as this much
@@ -68,32 +60,6 @@ def performance(scene: Scene, pressed: Pressed, throughput: float) -> Performanc
         specific_throughput=throughput / (rolls.diameter * rolls.width * rolls.surface_speed),
         nip_angle=pressed.nip_angle,
         force_angle=math.asin(min(bed_power / (2 * force * rolls.surface_speed), 1.0)) if force > 0 else 0.0,
-    )
-
-
-def unusual(scene: Scene, found: Performance, exit_solid_fraction: float) -> str:
-    """Return in words what leaves the range of usual machines, or nothing.
-
-    Examples
-    --------
-    >>> import hpgr
-    >>> from hpgr.bed import machine
-    >>> scene = hpgr.presets.industrial()
-    >>> found = machine.performance(scene, machine.Pressed(8e6, 4e5, 0.159), throughput=200.0)
-    >>> machine.unusual(scene, found, exit_solid_fraction=0.85)
-    'specific energy 0.5556 kWh/t (usual 1 kWh/t to 3 kWh/t)'
-    """
-    values = {
-        "roll diameter": scene.rolls.diameter,
-        "specific pressing force": found.specific_pressing_force,
-        "specific energy": found.specific_energy,
-        "gap over diameter": scene.rolls.gap / scene.rolls.diameter,
-        "exit solid fraction": exit_solid_fraction,
-    }
-    return "; ".join(
-        f"{name} {show(values[name], unit, 4)} (usual {show(low, unit)} to {show(high, unit)})"
-        for name, (low, high, unit) in USUAL.items()
-        if not low <= values[name] <= high
     )
 
 
