@@ -11,9 +11,10 @@ if TYPE_CHECKING:
     from hpgr import presets
     from hpgr.bed.machine import operating_gap
     from hpgr.calibration import calibrate
+    from hpgr.laws.exchange import Exchange
     from hpgr.results.metrics import passing, peak_pressure, percentile_size, reduction_ratio, throughput
     from hpgr.run import simulate
-    from hpgr.scene import Bed, Exchange, Resolution, Rolls, Scene
+    from hpgr.scene import Bed, Resolution, Rolls, Scene
 
 __version__ = version("hpgr")
 
@@ -21,7 +22,7 @@ _HOMES = {
     "Scene": "scene",
     "Rolls": "scene",
     "Bed": "scene",
-    "Exchange": "scene",
+    "Exchange": "laws.exchange",
     "Resolution": "scene",
     "simulate": "run",
     "passing": "results.metrics",
