@@ -70,10 +70,15 @@ def _labelled(space: Space, values: dict[str, Any], attrs: dict[str, Any]) -> xr
     """Return arrays over the dimensions of a sweep and those of a simulation as a Dataset."""
     own = {dim: schema.field_axis(field, dim) for field, dim in zip(space.grid, space.dims, strict=False)}
     for name, entry in (schema.COORDINATES | schema.VARIABLES | schema.SWEEP).items():
-        common = name in space.dims or (name in schema.COORDINATES and name in (*entry.dims, "width_position"))
-        if not common:
+        if name not in space.dims and not _common(name):
             own[name] = entry._replace(dims=(*space.dims, *entry.dims))
     return schema.to_dataset(values, attrs, own)
+
+
+def _common(name: str) -> bool:
+    """Return whether a variable of a simulation is a coordinate that is the same for every case."""
+    dims = schema.COORDINATES[name].dims if name in schema.COORDINATES else ("point",)
+    return name in dims or not {"point", "time"} & set(dims)
 
 
 def _held(base: Scene, space: Space) -> dict[str, xr.Variable]:
@@ -176,11 +181,12 @@ def open_cases(folder: str | Path) -> xr.Dataset:
     lazy = _lazily(np.array(paths, object).reshape(space.shape))
     for name in (name for name in shapes if name not in left_out):
         entry = schema.COORDINATES.get(name) or schema.VARIABLES[name]
-        if entry.dims == (name,):  # the same for every case
+        if _common(name):
             values[name] = netcdf.read_variable(files[0], _IN_FILES.get(name, name))
         else:
             values[name] = lazy(name, shapes[name], np.dtype(entry.dtype))
-    return _labelled(space, values, told["attrs"] | {"left_out": ", ".join(left_out)})
+    found = _labelled(space, values, told["attrs"] | {"left_out": ", ".join(left_out)})
+    return found.assign_coords(_held(netcdf.scene_of(found), space))
 
 
 def _manifest(path: Path) -> dict[str, Any]:

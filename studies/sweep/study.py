@@ -188,7 +188,7 @@ def _report(field: str, caption: str, result: "xr.Dataset", sieve: float) -> Rep
 
         return sweeps.sweep_figure(result, field, sieve, "\n".join(sayings))
 
-    lines = [report.table(result, sieve), *report.notes(result), *sayings]
+    lines = [report.table(result, sieve), *report.remarks(result), *sayings]
     return Report(lines, [result, line.figure(drawn)], lost)
 
 
@@ -201,12 +201,20 @@ def _cases(scene: Scene, space: Space, options: Options, folder: Path) -> list[s
     spec = SweepSpec(scene, options.seed, options.tolerance, options.max_cost, code=code_version())
     kept = {} if options.recompute else finished(spec, space, folder)
     headings = [f"{dim.replace('_', ' ')} [{unit_shown(field_info(AXES[dim]).unit)[0]}]" for dim in space.dims[:-1]]
-    rows, seconds = [], 0.0
+    rows, refused, seconds = [], [], 0.0
     for case in Space(space.grid, 1).cases():
-        shown, time = _row(scene, case.values, space.replicates, kept.get(case.index[:-1], 0))
-        rows.append(shown if kept else shown[:-1])
-        seconds += time
-    lines = [f"{scene}\n", aligned([*headings, "memory", "time", *(["finished"] if kept else [])], rows), ""]
+        place = [show(value, field_info(name).unit) for name, value in case.values.items()]
+        try:
+            cost = predict(scene.with_values(case.values))
+        except ValidationError as error:
+            refused.append(f"refused: {', '.join(place)}: {faults_of(error)}")
+            continue
+        done = kept.get(case.index[:-1], 0)
+        seconds += cost.seconds * (space.replicates - done)
+        figures = [f"{cost.bytes / 1e6:.1f} MB", f"{cost.seconds * 1e3:.1f} ms", f"{done} of {space.replicates}"]
+        rows.append([*place, *figures[: 3 if kept else 2]])
+    table = aligned([*headings, "memory", "time", *(["finished"] if kept else [])], rows)
+    lines = [f"{scene}\n", table, *refused, ""]
     if options.tolerance is not None:
         lines.append(
             f"before refinement: --tolerance {options.tolerance:g} chooses points and cells when a case is run"
@@ -217,14 +225,3 @@ def _cases(scene: Scene, space: Space, options: Options, folder: Path) -> list[s
         f"{options.workers} threads, plus start-up"
     )
     return lines
-
-
-def _row(scene: Scene, values: dict[str, float], replicates: int, done: int) -> tuple[list[str], float]:
-    """Return the row of an operating point, and the seconds that its unfinished replicates are predicted to take."""
-    place = [show(value, field_info(name).unit) for name, value in values.items()]
-    try:
-        cost = predict(scene.with_values(values))
-    except ValidationError as error:
-        return [*place, "", "", f"refused: {faults_of(error)}"], 0.0
-    figures = [f"{cost.bytes / 1e6:.1f} MB", f"{cost.seconds * 1e3:.1f} ms", f"{done} of {replicates}"]
-    return [*place, *figures], cost.seconds * (replicates - done)
