@@ -271,8 +271,9 @@ def _climb(ladder: Ladder, seed: int, bar: Any) -> Samples:
 
 def _run(scene: Scene, seed: int, replicate: int) -> tuple[list[float], float]:
     """Return the quantities of one run, unrounded by a Dataset, and its wall time in s."""
-    from hpgr import run
+    from hpgr import cost, run
 
+    cost.refuse_too_large(scene)
     begun = time.perf_counter()
     values = run.run_scene(scene, seed, replicate).values
     seconds = time.perf_counter() - begun
@@ -287,14 +288,14 @@ def _storage(scene: Scene, seed: int, replicates: int) -> dict[str, np.ndarray]:
     apart, as a decision fell the other way.
     """
     from hpgr import run
-    from hpgr.grains import march
+    from hpgr.grains import march, solve
 
     scene, bed = run.load(scene)
-    log_stress = march.log_stress(scene, bed)
+    log_stress = scene.strength.log_stress(solve.crushing_stress(scene, bed))
     products = np.empty((2, replicates, len(log_stress), scene.resolution.cells))
     for k, dtype in enumerate((np.float32, np.float64)):
         for replicate, line in np.ndindex(products.shape[1:3]):
-            (sizes,), (streams,) = march.first_cells(scene, seed, [(replicate, line, 0)])
+            sizes, streams = (part[0, 1:-1] for part in march.first_cells(scene, seed, [(replicate, line, 0)]))
             sizes = sizes.astype(dtype)
             plain_march(scene, sizes, streams, log_stress[line])
             products[k, replicate, line] = sizes
@@ -317,13 +318,10 @@ def plain_march(scene: Scene, sizes: np.ndarray, streams: np.ndarray, log_stress
     from hpgr.grains import kernels
 
     mix = getattr(kernels.mix, "py_func", kernels.mix)  # the Python function takes arrays as well
-    ore, fragments = scene.strength, scene.fragments
+    fragments = scene.fragments
     for stress in log_stress[np.isfinite(log_stress)]:
         wide = sizes.astype(float)
-        mean = ((np.roll(wide, 1) + np.roll(wide, -1)) + wide) / 3
-        unlike = np.log(wide / mean) ** 2 / (2 * ore.cushioning * ore.cushioning)
-        strength = unlike - 3 / ore.weibull_modulus * np.log(wide / ore.reference_size)
-        hit = (stress >= strength) & (wide >= fragments.size_floor)
+        hit = (stress >= scene.strength.log_strength(wide)) & (wide >= fragments.size_floor)
         streams[hit] += _GOLDEN
         uniform = ((mix(streams[hit]) >> np.uint64(12)).astype(float) + 0.5) * 2.0**-52
         sizes[hit] = np.maximum(wide[hit] * uniform ** (1 / fragments.exponent), kernels.SMALLEST)

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import xarray as xr
 
-from hpgr.grains import kernels, solve
-from hpgr.laws.exchange import MOST_SUBSTEPS
+from hpgr.grains import kernels, march
+from hpgr.grains.lattice import MOST_SUBSTEPS
 from hpgr.results import flags, metrics
 from hpgr.scene import Scene
 
@@ -305,7 +305,8 @@ def feed_cells(scene: Scene, result: Result) -> np.ndarray:
     grid = scene.resolution
     shape = (grid.snapshots, grid.streamlines)
     keys = [(int(result.attrs["replicate"]), line, snapshot) for snapshot, line in np.ndindex(shape)]
-    return parcels.first_cells(scene, int(result.attrs["seed"]), keys)[0].reshape(*shape, grid.cells)
+    cells = march.first_cells(scene, int(result.attrs["seed"]), keys)[0][:, 1:-1]
+    return cells.reshape(*shape, grid.cells)
 
 
 def _feed_passing(scene: Scene, result: Result) -> np.ndarray | None:
