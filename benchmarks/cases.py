@@ -15,7 +15,9 @@ import time
 import numpy as np
 
 import hpgr
-from hpgr import kernels, parcels, pipeline, solve, tessellation
+from hpgr.bed.loaded import Beds, inputs_of, load_bed
+from hpgr.grains import kernels, march, solve
+from hpgr.run import run_scene
 from studies.sweep import sweep
 
 
@@ -30,19 +32,16 @@ def median_ms(function, repeats=30):
     return 1e3 * statistics.median(times)
 
 
-def kernel_ms(scene, prepared):
+def kernel_ms(scene, bed):
     """Return the median time in the crushing kernel of one run, with fresh cells each time."""
-    with np.errstate(divide="ignore"):
-        log_stress = np.log(prepared.crushing / scene.material.strength)
-    needed = parcels.reach_needed(scene, log_stress)
-    none = (np.empty(0), np.empty((0, 0), np.float32), np.empty((0, 0), np.int64))
+    path = march.path(scene, scene.strength.log_stress(solve.crushing_stress(scene, bed)))
+    record = kernels.Record(np.empty(0), np.empty((0, 0, 0), np.float32), np.empty((0, 0, 0), np.int64))
+    lines, breaks = np.arange(len(path.log_stress)), np.empty(len(path.log_stress), np.int64)
     times = []
     for replicate in range(31):
-        keys = [(replicate, line, 0) for line in range(len(log_stress))]
-        sizes, streams = parcels.first_cells(scene, 0, keys)
+        sizes, streams = march.first_cells(scene, 0, [(replicate, line, 0) for line in lines])
         start = time.perf_counter()
-        for line in range(len(keys)):
-            kernels.march(sizes[line], streams[line], log_stress[line], needed[line], *none, *parcels.constants(scene))
+        kernels.march(sizes, streams, lines, path, march.ore(scene), record, breaks)
         times.append(time.perf_counter() - start)
     return 1e3 * statistics.median(times[1:])
 
@@ -63,16 +62,13 @@ def main():
     """Print every figure."""
     print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}")
     scene = hpgr.presets.paper().with_values({"resolution.record": "product"})
-    prepared = pipeline.prepare(scene)
+    inputs, beds = inputs_of(scene), Beds(1)
     print(f"simulate, 10 x 200 x 1,000, product: {median_ms(lambda: hpgr.simulate(scene)):.2f} ms")
-    print(f"  of which the kernel:               {kernel_ms(scene, prepared):.2f} ms")
-    print(f"  of which bed and stress:           {median_ms(lambda: pipeline.prepare(scene)):.2f} ms")
-    print(f"a case that shares its bed:          {median_ms(lambda: pipeline.crush(scene, prepared, 0, 0)):.2f} ms")
-
-    motion = prepared.motion
-    print(
-        f"tessellation, 10 x 200: {median_ms(lambda: tessellation.tessellate(scene, prepared.bed, motion), 5):.0f} ms"
-    )
+    print(f"  of which the kernel:               {kernel_ms(scene, load_bed(inputs)):.2f} ms")
+    print(f"  of which bed and stress:           {median_ms(lambda: load_bed(inputs)):.2f} ms")
+    print(f"a case that shares its bed:          {median_ms(lambda: run_scene(scene, beds=beds)):.2f} ms")
+    tessellated = median_ms(lambda: load_bed(inputs._replace(tessellated=True)), 5)
+    print(f"tessellation, 10 x 200:              {tessellated - median_ms(lambda: load_bed(inputs)):.0f} ms")
 
     sweep_ratio("1,000 cases of 10 x 200 x 1,000, 50 gaps x 20 feeds", scene, 50)
     sweep_ratio("4,000 cases of 10 x 200 x 1,000, 200 gaps x 20 feeds", scene, 200)
@@ -82,7 +78,7 @@ def main():
     seconds = median_ms(lambda: hpgr.simulate(mixed), 3) / 1e3
     swaps = float(hpgr.simulate(mixed)["swaps_per_cell"]) * 10 * 200 * 1000 / 2
     print(f"lattice, one residence time: {seconds:.2f} s, {1e9 * seconds / swaps:.1f} ns per swap, all else included")
-    twice = mixed.with_values({"exchange.interval": 199, "resolution.photographs": 2})
+    twice = mixed.with_values({"exchange.interval": 199, "resolution.snapshots": 2})
     print(f"lattice, two residence times: {median_ms(lambda: hpgr.simulate(twice), 1) / 1e3:.2f} s")
     still = scene.with_values({"exchange.mixing": 0, "exchange.segregation": 0})
     print(f"lattice without swaps, one residence time: {median_ms(lambda: hpgr.simulate(still), 3) / 1e3:.2f} s")
@@ -91,9 +87,9 @@ def main():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     many = median_ms(lambda: hpgr.simulate(large), 1) / 1e3
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
-    solve._LARGE, kept = float("inf"), solve._LARGE
+    march._LARGE, kept = float("inf"), march._LARGE
     alone = median_ms(lambda: hpgr.simulate(large), 1) / 1e3
-    solve._LARGE = kept
+    march._LARGE = kept
     print(f"10 x 200 x 1,000,000: {alone:.2f} s on one core, {many:.2f} s on all; {grown:.0f} MiB above before")
 
     for arguments in (["--help"], ["--no-plot", "--out", "outputs/benchmark.nc"], ["--out", "outputs/benchmark.nc"]):

@@ -20,9 +20,8 @@ import numpy as np
 import psutil
 
 import hpgr
-from hpgr import pipeline
-from studies import store
-from studies.sweep import sweep
+from hpgr.run import run_scene
+from studies.sweep import netcdf, sweep
 
 COUNTS = {10: 5, 100: 3, 1000: 3, 10_000: 1, 20_000: 1}  # cases: repeats
 
@@ -68,7 +67,7 @@ def own_ms(scene):
     for k in range(200):
         start = time.perf_counter()
         one = scene.with_values({"rolls.gap": 0.03 + 1e-4 * k})
-        pipeline.crush(one, pipeline.prepare(one), 0, 0)
+        run_scene(one)
         times.append(time.perf_counter() - start)
     return 1e3 * statistics.median(times)
 
@@ -97,8 +96,8 @@ def main():
                 with Peak() as reading:
                     *back, _ = timed(lambda: sweep(scene, axes_of(count), folder=folder))  # noqa: B023
                 shutil.rmtree(folder)
-                figures.append((*without, *kept, kept[0] / without[0], kept[1] / without[1], *back,
-                                computing.megabytes, reading.megabytes))  # fmt: skip
+                ratios = kept[0] / without[0], kept[1] / without[1]
+                figures.append((*without, *kept, *ratios, *back, computing.megabytes, reading.megabytes))
             figures = [statistics.median(column) for column in zip(*figures, strict=True)]
             figures = [1e3 * value / count if k in (0, 1, 2, 3, 6, 7) else value for k, value in enumerate(figures)]
             line = "{:6d} {:8.2f} ({:5.2f}) {:8.2f} ({:5.2f}) {:5.2f} ({:4.2f}) {:8.3f} ({:5.3f}) {:8.0f} {:8.0f}"
@@ -108,11 +107,11 @@ def main():
         ratios = []
         for _ in range(3):
             *without, _ = timed(lambda: sweep(full, axes))
-            *kept, _ = timed(lambda: sweep(full, axes, folder=folder, force=True))
+            *kept, _ = timed(lambda: sweep(full, axes, folder=folder, recompute=True))
             ratios.append((*without, *kept, kept[0] / without[0], kept[1] / without[1]))
         figures = [statistics.median(column) for column in zip(*ratios, strict=True)]
-        print("1,000 cases of the paper's scene, s: {:.2f} ({:.2f}) without folder, {:.2f} ({:.2f}) with, ratio {:.2f} "
-              "({:.2f})".format(*figures), flush=True)  # fmt: skip
+        line = "{:.2f} ({:.2f}) without folder, {:.2f} ({:.2f}) with, ratio {:.2f} ({:.2f})"
+        print(f"1,000 cases of the paper's scene, s: {line.format(*figures)}", flush=True)
         few = full.with_values({"resolution.points": 10, "resolution.cells": 10})
         axes = axes_of(20_000)
         with Peak() as computing:
@@ -123,7 +122,7 @@ def main():
             seconds, used, result = timed(lambda: sweep(few, axes, folder=home / "many"))
         print(f"  read back and assembled: {seconds:.1f} s ({used:.1f} s)")
         print(f"  peak {reading.megabytes:.0f} MB above before, of which the result {result.nbytes / 1e6:.0f} MB")
-        seconds, used, _ = timed(lambda: store.write_dataset(result, home / "many.nc"))
+        seconds, used, _ = timed(lambda: netcdf.write_dataset(result, home / "many.nc"))
         kept = sum(path.stat().st_size for path in (home / "many").iterdir())
         segments = len(list((home / "many").glob("*.seg")))
         print(f"  written in {seconds:.1f} s ({used:.1f} s): {(home / 'many.nc').stat().st_size / 1e6:.0f} MB")

@@ -10,7 +10,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from test_tolerance import WANTED, random_scenes, reference
 
-from hpgr import pipeline, tolerance
+from hpgr import tolerance
+from hpgr.run import run_scene
 
 
 def main():
@@ -19,14 +20,13 @@ def main():
     missed, figures = 0, 0
     for number, scene in enumerate(random_scenes(count)):
         estimate = tolerance.refine(scene, WANTED)
-        values = pipeline.crush(estimate.scene, pipeline.prepare(estimate.scene), 0, 0)
-        found, true = tolerance.figures_of(values), reference(scene)
+        found, true = tolerance.figures_of(run_scene(estimate.scene).values), reference(scene)
         for name, stated in estimate.errors().items():
             error = tolerance.relative(found, true, name)
             figures += 1
             if abs(error) > stated:
                 missed += 1
-                print(f"scene {number}, {name}: error {error:+.4f}, stated {stated:.4f}; {scene.material}")
+                print(f"scene {number}, {name}: error {error:+.4f}, stated {stated:.4f}; {scene.strength}")
     print(f"{missed} of {figures} figures exceed the stated error, at a tolerance of {WANTED}")
 
 
