@@ -42,7 +42,7 @@ def field_row(name: str, field: Any) -> list[str]:
     """Return what the table says of one field."""
     extra = field.json_schema_extra or {}
     unit, symbol = extra.get("unit", "1"), extra.get("symbol")
-    meaning = extra.get("text") or field.description
+    meaning = " ".join(field.description.split())
     shown = [f"`{name}`", f"`{symbol}`" if symbol else "", unit.replace("1", "") if unit == "1" else unit]
     return [*shown, default(field, unit), bounds(field), meaning, extra.get("source", "")]
 

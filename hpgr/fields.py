@@ -143,13 +143,13 @@ Number = Annotated[float, BeforeValidator(partial(_number, unit="1"))]
 Count = Annotated[int, BeforeValidator(_integer)]
 
 
-def quantity(
-    default: Any = ..., *, symbol: str, text: str, source: str, example: Any, unit: str = "1", **bounds: Any
-) -> Any:
-    """Return a pydantic field that also carries symbol, SI unit, meaning, source and an example of its value."""
-    extra = {"symbol": symbol, "unit": unit, "text": text, "source": source, "example": example}
-    description = f"{text} ({symbol}, {unit}). Source: {source}."
-    return Field(default, description=description, json_schema_extra=extra, **bounds)
+def quantity(default: Any = ..., *, symbol: str, source: str, example: Any, unit: str = "1", **bounds: Any) -> Any:
+    """Return a pydantic field that also carries symbol, SI unit, source and an example of its value.
+
+    What it means is the docstring below it, a sentence whose first part says what it is.
+    """
+    extra = {"symbol": symbol, "unit": unit, "source": source, "example": example}
+    return Field(default, json_schema_extra=extra, **bounds)
 
 
 def default_kind(kind: str) -> BeforeValidator:
@@ -182,7 +182,12 @@ class Frozen(BaseModel):
     """Frozen model that reports every fault of its input at once."""
 
     model_config = ConfigDict(
-        frozen=True, extra="forbid", allow_inf_nan=False, ser_json_inf_nan="strings", hide_input_in_errors=True
+        frozen=True,
+        extra="forbid",
+        allow_inf_nan=False,
+        ser_json_inf_nan="strings",
+        hide_input_in_errors=True,
+        use_attribute_docstrings=True,
     )
 
     @model_validator(mode="wrap")

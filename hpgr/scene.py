@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ValidationError
 
 from hpgr.fields import (
     Count,
@@ -56,60 +56,28 @@ class Rolls(Frozen):
     1.676
     """
 
-    diameter: Metres = quantity(
-        symbol="D", unit="m", text="Roll diameter", source="machine", example="0.8 m", ge=1e-3, le=1e3
-    )
-    width: Metres = quantity(
-        symbol="L",
-        unit="m",
-        text="Roll width, along the roll axes",
-        source="machine",
-        example="0.25 m",
-        ge=1e-4,
-        le=1e3,
-    )
-    gap: Metres = quantity(
-        symbol="s_b",
-        unit="m",
-        text="Gap where the rolls are closest",
-        source="machine",
-        example="20 mm",
-        ge=LEAST_GAP,
-        le=1e3,
-    )
-    entry_gap: Metres = quantity(
-        symbol="s_t",
-        unit="m",
-        text="Distance between the roll surfaces where the modelled bed begins",
-        source="machine",
-        example="100 mm",
-        ge=1e-6,
-        le=1e3,
-    )
+    diameter: Metres = quantity(symbol="D", unit="m", source="machine", example="0.8 m", ge=1e-3, le=1e3)
+    """Roll diameter."""
+    width: Metres = quantity(symbol="L", unit="m", source="machine", example="0.25 m", ge=1e-4, le=1e3)
+    """Roll width, along the roll axes."""
+    gap: Metres = quantity(symbol="s_b", unit="m", source="machine", example="20 mm", ge=LEAST_GAP, le=1e3)
+    """Gap where the rolls are closest."""
+    entry_gap: Metres = quantity(symbol="s_t", unit="m", source="machine", example="100 mm", ge=1e-6, le=1e3)
+    """Distance between the roll surfaces where the modelled bed begins."""
     speed: RadiansPerSecond = quantity(
-        symbol="omega", unit="rad s-1", text="Roll speed", source="machine", example="19 rpm", ge=1e-6, le=1e6
+        symbol="omega", unit="rad s-1", source="machine", example="19 rpm", ge=1e-6, le=1e6
     )
+    """Roll speed."""
     specific_pressing_force: Pascals | None = quantity(
-        None,
-        symbol="F_sp",
-        unit="Pa",
-        text="Pressing force over D L, held by the machine while the gap floats; the gap given is then only "
-        "where the nip angle is taken from a cake density",
-        source="machine",
-        example="3.5 N/mm^2",
-        ge=1,
-        le=1e12,
+        None, symbol="F_sp", unit="Pa", source="machine", example="3.5 N/mm^2", ge=1, le=1e12
     )
+    """Pressing force over D L, held by the machine while the gap floats; the gap given is then only where the nip angle
+    is taken from a cake density.
+    """
     idle_torque: NewtonMetres = quantity(
-        0.0,
-        symbol="T_0",
-        unit="N m",
-        text="Torque of both drives that does not go into the bed",
-        source="machine (calibrated); 0: none",
-        example="2 kN*m",
-        ge=0,
-        le=1e9,
+        0.0, symbol="T_0", unit="N m", source="machine (calibrated); 0: none", example="2 kN*m", ge=0, le=1e9
     )
+    """Torque of both drives that does not go into the bed."""
 
     @property
     def surface_speed(self) -> float:
@@ -137,33 +105,13 @@ class Bed(Frozen):
     """Density of the grains, and how densely the bed packs."""
 
     solid_density: Density = quantity(
-        2650.0,
-        symbol="rho_s",
-        unit="kg m-3",
-        text="Density of the grains",
-        source="quartz, 2650 kg/m3",
-        example=2700,
-        ge=1,
-        le=1e5,
+        2650.0, symbol="rho_s", unit="kg m-3", source="quartz, 2650 kg/m3", example=2700, ge=1, le=1e5
     )
-    feed_solid_fraction: Number = quantity(
-        0.6,
-        symbol="phi_feed",
-        text="Solid fraction of the feed where compaction begins",
-        source="ours",
-        example=0.6,
-        ge=1e-3,
-        le=1,
-    )
-    max_solid_fraction: Number = quantity(
-        0.9,
-        symbol="phi_max",
-        text="Solid fraction that the bed cannot exceed",
-        source="ours",
-        example=0.9,
-        ge=1e-3,
-        le=1,
-    )
+    """Density of the grains."""
+    feed_solid_fraction: Number = quantity(0.6, symbol="phi_feed", source="ours", example=0.6, ge=1e-3, le=1)
+    """Solid fraction of the feed where compaction begins."""
+    max_solid_fraction: Number = quantity(0.9, symbol="phi_max", source="ours", example=0.9, ge=1e-3, le=1)
+    """Solid fraction that the bed cannot exceed."""
 
     @classmethod
     def _impossible(cls, known: dict[str, Any]) -> Iterator[Fault]:
@@ -212,57 +160,28 @@ class Resolution(Frozen):
     800
     """
 
-    streamlines: Count = quantity(
-        10,
-        symbol="N",
-        text="Streamlines from the mid-plane to the roll",
-        source="ours",
-        example=10,
-        ge=1,
-        le=10_000,
-    )
-    points: Count = quantity(
-        200,
-        symbol="P",
-        text="Material points on a streamline, one time step apart",
-        source="ours",
-        example=200,
-        ge=2,
-        le=10_000_000,
-    )
-    cells: Count = quantity(
-        1000,
-        symbol="M",
-        text="Cells of a material point, each an equal mass of grains of one size; 0: stress only",
-        source="paper fig. 2",
-        example=1000,
-        ge=0,
-        le=2_000_000_000,
-    )
-    snapshots: Count = quantity(
-        1,
-        symbol="n_t",
-        text="Independent snapshots of the steady machine",
-        source="ours",
-        example=1,
-        ge=1,
-        le=1_000_000,
-    )
-    record: Literal["cells", "distributions", "product"] = Field(
-        "cells",
-        description="What is kept: 'cells' (every size), 'distributions' (mass per sieve at every point), "
-        "'product' (size distribution at the exit)",
-    )
+    streamlines: Count = quantity(10, symbol="N", source="ours", example=10, ge=1, le=10_000)
+    """Streamlines from the mid-plane to the roll."""
+    points: Count = quantity(200, symbol="P", source="ours", example=200, ge=2, le=10_000_000)
+    """Material points on a streamline, one time step apart."""
+    cells: Count = quantity(1000, symbol="M", source="paper fig. 2", example=1000, ge=0, le=2_000_000_000)
+    """Cells of a material point, each an equal mass of grains of one size; 0: stress only."""
+    snapshots: Count = quantity(1, symbol="n_t", source="ours", example=1, ge=1, le=1_000_000)
+    """Independent snapshots of the steady machine."""
+    record: Literal["cells", "distributions", "product"] = "cells"
+    """What is kept: 'cells' (every size), 'distributions' (mass per sieve at every point), 'product' (size distribution
+    at the exit).
+    """
     sieves: tuple[Metres, ...] = quantity(
         _default_sieves(),
         symbol="s_k",
         unit="m",
-        text="Sieves of the recorded distributions, finest first",
         source="ours (R10 series, 1 um to 1 m)",
         example=["1 mm", "10 mm"],
         min_length=1,
         max_length=10_000,
     )
+    """Sieves of the recorded distributions, finest first."""
 
     @classmethod
     def _impossible(cls, known: dict[str, Any]) -> Iterator[Fault]:
@@ -310,19 +229,28 @@ class Scene(Frozen):
     <hpgr.Scene: rolls 800 mm x 250 mm, gap 19 mm, 16 rpm; uniform feed to 20 mm; 10 x 200 x 1000>
     """
 
-    rolls: Rolls = Field(description="The machine")
-    feed: Feed = Field(description="Size distribution of the feed")
-    bed: Bed = Field(Bed(), description="Density and packing of the bed")
-    flow: Flow = Field(PowerFlow(), description="How the bed moves")
-    elasticity: Elasticity = Field(Elasticity(), description="How the bed is loaded; default: the paper's sand")
-    strength: Strength = Field(Strength(), description="When a grain breaks; default: the paper's quartz")
-    fragments: Fragments = Field(Fragments(), description="What a broken grain leaves")
-    exchange: Exchange | None = Field(None, description="Segregation and mixing; None switches both off")
-    roll_width: RollWidth | None = Field(None, description="Pressure along the roll width; None: the same all along")
-    resolution: Annotated[Resolution, BeforeValidator(_of_level)] = Field(
-        Resolution(), description="How finely, and what is kept; or the name of a level"
-    )
-    remark: str = Field("", description="What a reader of the results should know, such as what is not calibrated")
+    rolls: Rolls
+    """The machine."""
+    feed: Feed
+    """Size distribution of the feed."""
+    bed: Bed = Bed()
+    """Density and packing of the bed."""
+    flow: Flow = PowerFlow()
+    """How the bed moves."""
+    elasticity: Elasticity = Elasticity()
+    """How the bed is loaded; default: the paper's sand."""
+    strength: Strength = Strength()
+    """When a grain breaks; default: the paper's quartz."""
+    fragments: Fragments = Fragments()
+    """What a broken grain leaves."""
+    exchange: Exchange | None = None
+    """Segregation and mixing; None switches both off."""
+    roll_width: RollWidth | None = None
+    """Pressure along the roll width; None: the same all along."""
+    resolution: Annotated[Resolution, BeforeValidator(_of_level)] = Resolution()
+    """How finely, and what is kept; or the name of a level."""
+    remark: str = ""
+    """What a reader of the results should know, such as what is not calibrated."""
 
     @classmethod
     def _impossible(cls, known: dict[str, Any]) -> Iterator[Fault]:
@@ -530,8 +458,8 @@ def field_info(name: str) -> FieldInfo:
     """
     _, field = _find_field(name)
     extra = field.json_schema_extra or {}
-    text = extra.get("text") or field.description or name
-    return FieldInfo(extra.get("unit", "1"), extra.get("symbol", name.rpartition(".")[2]), re.split("[;:]", text)[0])
+    text = re.split("[;:]", " ".join(field.description.split()).rstrip("."))[0]
+    return FieldInfo(extra.get("unit", "1"), extra.get("symbol", name.rpartition(".")[2]), text)
 
 
 def field_value(name: str, value: Any) -> Any:

@@ -496,7 +496,7 @@ def test_every_field_is_described_and_every_number_carries_symbol_unit_source_an
     for name, field in FIELDS.items():
         assert field.description, name
         if field.json_schema_extra:
-            assert "Source: " in field.description
+            assert field.json_schema_extra["source"]
             assert field.json_schema_extra["example"] is not None
             info = field_info(name)
             assert info.unit

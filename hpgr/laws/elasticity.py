@@ -4,7 +4,6 @@ import math
 from typing import Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from hpgr.fields import Count, Frozen, Number, Pascals, quantity
 
@@ -35,42 +34,21 @@ class GranularElasticity(Frozen):
 
     kind: Literal["granular"] = "granular"
     bulk_modulus: Pascals = quantity(
-        28.3e6,
-        symbol="K",
-        unit="Pa",
-        text="Scaling of the bed's bulk modulus",
-        source="paper section 3 (Fontainebleau sand)",
-        example="28.3 MPa",
-        ge=1,
-        le=1e15,
+        28.3e6, symbol="K", unit="Pa", source="paper section 3 (Fontainebleau sand)", example="28.3 MPa", ge=1, le=1e15
     )
+    """Scaling of the bed's bulk modulus."""
     shear_modulus: Pascals = quantity(
-        13.1e6,
-        symbol="G",
-        unit="Pa",
-        text="Scaling of the bed's shear modulus",
-        source="paper section 3 (Fontainebleau sand)",
-        example="13.1 MPa",
-        ge=1,
-        le=1e15,
+        13.1e6, symbol="G", unit="Pa", source="paper section 3 (Fontainebleau sand)", example="13.1 MPa", ge=1, le=1e15
     )
-    exponent: Number = quantity(
-        0.5,
-        symbol="c",
-        text="Pressure sensitivity of granular elasticity",
-        source="paper eq. 4; value ours (Hertz)",
-        example=0.5,
-        gt=-1,
-        le=10,
-    )
-    integrator: Literal["increment", "euler"] = Field(
-        "increment",
-        description="'increment': increments of the state functions, exact at constant solid fraction (ours); "
-        "'euler': the paper's explicit rule",
-    )
-    substeps: Count = quantity(
-        1, symbol="k", text="Stress steps per time step", source="ours", example=1, ge=1, le=10_000
-    )
+    """Scaling of the bed's shear modulus."""
+    exponent: Number = quantity(0.5, symbol="c", source="paper eq. 4; value ours (Hertz)", example=0.5, gt=-1, le=10)
+    """Pressure sensitivity of granular elasticity."""
+    integrator: Literal["increment", "euler"] = "increment"
+    """'increment': increments of the state functions, exact at constant solid fraction (ours); 'euler': the paper's
+    explicit rule.
+    """
+    substeps: Count = quantity(1, symbol="k", source="ours", example=1, ge=1, le=10_000)
+    """Stress steps per time step."""
 
     def pressure(self, eps_v, eps_s):
         """Return p / phi^3 = K eps_v^(c+1)/(c+1) + 3/2 G c eps_v^(c-1) eps_s^2, Pa; 0 at eps_v = 0."""

@@ -11,8 +11,6 @@ do not depend on speed.
 
 from typing import Literal
 
-from pydantic import Field
-
 from hpgr.fields import Count, Frozen, Number, quantity
 
 
@@ -29,34 +27,16 @@ class Exchange(Frozen):
     0.1
     """
 
-    segregation: Number = quantity(
-        0.1,
-        symbol="A",
-        text="Percolation velocity over shear rate and size difference: large grains rise, small ones sink",
-        source="ours",
-        example=0.1,
-        ge=0,
-        le=100,
-    )
-    mixing: Number = quantity(
-        0.1,
-        symbol="B",
-        text="Shear-induced self-diffusion over shear rate and mean size squared",
-        source="ours",
-        example=0.1,
-        ge=0,
-        le=100,
-    )
-    start: Literal["feed", "crushed"] = Field(
-        "feed",
-        description="What the machine is filled with at the start: 'feed', or the bed as 'crushed' without exchange",
-    )
-    interval: Count = quantity(
-        20, symbol="n_s", text="Time steps between snapshots", source="ours", example=20, ge=1, le=1_000_000
-    )
-    record_startup: bool = Field(
-        False, description="Whether snapshots of the start-up, from the first fill on, come before the steady ones"
-    )
+    segregation: Number = quantity(0.1, symbol="A", source="ours", example=0.1, ge=0, le=100)
+    """Percolation velocity over shear rate and size difference: large grains rise, small ones sink."""
+    mixing: Number = quantity(0.1, symbol="B", source="ours", example=0.1, ge=0, le=100)
+    """Shear-induced self-diffusion over shear rate and mean size squared."""
+    start: Literal["feed", "crushed"] = "feed"
+    """What the machine is filled with at the start: 'feed', or the bed as 'crushed' without exchange."""
+    interval: Count = quantity(20, symbol="n_s", source="ours", example=20, ge=1, le=1_000_000)
+    """Time steps between snapshots."""
+    record_startup: bool = False
+    """Whether snapshots of the start-up, from the first fill on, come before the steady ones."""
 
     def percolation(self, sheared, upward, parcel):
         """Return the probability per time step and m of size difference that a cell rises over an edge, 1/m.

@@ -16,9 +16,6 @@ from pydantic_core import PydanticCustomError
 from hpgr import tables
 from hpgr.fields import Fault, Frozen, Metres, Number, quantity, show
 
-_TOP = {"symbol": "s_max", "unit": "m", "text": "Largest grain", "source": "feed", "example": "60 mm", "le": 10}
-_EXPONENT = {"symbol": "m", "text": "Exponent of the distribution", "source": "feed", "example": 0.7}
-
 
 class _Distribution(Frozen):
     @property
@@ -53,10 +50,10 @@ class UniformFeed(_Distribution):
     """Uniform in size between bottom_size and top_size (the paper's feed)."""
 
     kind: Literal["uniform"] = "uniform"
-    bottom_size: Metres = quantity(
-        symbol="s_min", unit="m", text="Smallest grain", source="feed", example="8 mm", ge=0, le=10
-    )
-    top_size: Metres = quantity(**_TOP, ge=1e-6)
+    bottom_size: Metres = quantity(symbol="s_min", unit="m", source="feed", example="8 mm", ge=0, le=10)
+    """Smallest grain."""
+    top_size: Metres = quantity(symbol="s_max", unit="m", source="feed", example="60 mm", ge=1e-6, le=10)
+    """Largest grain."""
 
     @classmethod
     def _impossible(cls, known: dict[str, Any]) -> Iterator[Fault]:
@@ -76,9 +73,8 @@ class SingleFeed(_Distribution):
     """All grains of one size."""
 
     kind: Literal["single"] = "single"
-    size: Metres = quantity(
-        symbol="s_0", unit="m", text="Size of every grain", source="feed", example="40 mm", ge=1e-6, le=10
-    )
+    size: Metres = quantity(symbol="s_0", unit="m", source="feed", example="40 mm", ge=1e-6, le=10)
+    """Size of every grain."""
 
     @property
     def largest_grain(self) -> float:
@@ -96,8 +92,10 @@ class PowerLawFeed(_Distribution):
     """Gates-Gaudin-Schuhmann: passing = (s / top_size)**exponent."""
 
     kind: Literal["power_law"] = "power_law"
-    top_size: Metres = quantity(**_TOP, ge=1e-6)
-    exponent: Number = quantity(**_EXPONENT, ge=0.1, le=100)
+    top_size: Metres = quantity(symbol="s_max", unit="m", source="feed", example="60 mm", ge=1e-6, le=10)
+    """Largest grain."""
+    exponent: Number = quantity(symbol="m", source="feed", example=0.7, ge=0.1, le=100)
+    """Exponent of the distribution."""
 
     def _passing(self, size):
         return np.clip(size / self.top_size, 0.0, 1.0) ** self.exponent
@@ -110,11 +108,12 @@ class RosinRammlerFeed(_Distribution):
     """Rosin-Rammler: passing = 1 - exp(-(s / size)**exponent), renormalised below top_size."""
 
     kind: Literal["rosin_rammler"] = "rosin_rammler"
-    size: Metres = quantity(
-        symbol="s_0", unit="m", text="Size that 63.2 % passes", source="feed", example="40 mm", ge=1e-6, le=10
-    )
-    exponent: Number = quantity(**_EXPONENT, ge=0.1, le=100)
-    top_size: Metres = quantity(**_TOP, ge=1e-6)
+    size: Metres = quantity(symbol="s_0", unit="m", source="feed", example="40 mm", ge=1e-6, le=10)
+    """Size that 63.2 % passes."""
+    exponent: Number = quantity(symbol="m", source="feed", example=0.7, ge=0.1, le=100)
+    """Exponent of the distribution."""
+    top_size: Metres = quantity(symbol="s_max", unit="m", source="feed", example="60 mm", ge=1e-6, le=10)
+    """Largest grain."""
 
     def _passing(self, size):
         return np.clip(self._unscalped(size) / self._unscalped(self.top_size), 0.0, 1.0)
@@ -154,13 +153,11 @@ class TableFeed(_Distribution):
 
     kind: Literal["table"] = "table"
     table: Annotated[tuple[tuple[Metres, Number], ...], BeforeValidator(_sieve_rows)] = quantity(
-        symbol="F_0",
-        unit="m, %",
-        text="Rows (size, percent passing), or the path of a CSV file",
-        source="feed",
-        example="my_sieves.csv",
+        symbol="F_0", unit="m, %", source="feed", example="my_sieves.csv"
     )
-    top_size: Metres | None = quantity(None, **_TOP | {"text": "Size at which the table is scalped"}, ge=1e-6)
+    """Rows (size, percent passing), or the path of a CSV file."""
+    top_size: Metres | None = quantity(None, symbol="s_max", unit="m", source="feed", example="60 mm", ge=1e-6, le=10)
+    """Size at which the table is scalped."""
 
     @property
     def largest_grain(self) -> float:

@@ -26,15 +26,8 @@ class FlowConstants(NamedTuple):
 
 
 class _Profile(Frozen):
-    entry_fraction: Number = quantity(
-        0.02,
-        symbol="y_0/H",
-        text="Depth of the first material point as a fraction of the bed's height (v = 0 at depth 0)",
-        source="ours",
-        example=0.02,
-        ge=1e-9,
-        lt=1,
-    )
+    entry_fraction: Number = quantity(0.02, symbol="y_0/H", source="ours", example=0.02, ge=1e-9, lt=1)
+    """Depth of the first material point as a fraction of the bed's height (v = 0 at depth 0)."""
 
     def held(self, gap: float, diameter: float, feed_solid_fraction: float) -> Self:
         """Return the profile with what is held while the gap floats; by default nothing."""
@@ -57,15 +50,8 @@ class PowerFlow(_Profile):
     """
 
     kind: Literal["power"] = "power"
-    exponent: Number = quantity(
-        1.0,
-        symbol="m",
-        text="Exponent of the speed profile; 1 is the paper's linear law",
-        source="paper section 2.2",
-        example=1,
-        ge=0.01,
-        le=5,
-    )
+    exponent: Number = quantity(1.0, symbol="m", source="paper section 2.2", example=1, ge=0.01, le=5)
+    """Exponent of the speed profile; 1 is the paper's linear law."""
 
     def vertical_speed(self, depth, slope):
         """Return |v_y| / U at the depth fraction 1 - y/H, where the streamline has the slope dx/dy."""
@@ -94,24 +80,13 @@ class NipFlow(_Profile):
 
     kind: Literal["nip"] = "nip"
     nip_angle: Radians | None = quantity(
-        None,
-        symbol="alpha",
-        unit="rad",
-        text="Nip angle: where the rolls grip the bed",
-        source="machine and ore",
-        example="9 deg",
-        ge=1e-3,
-        lt=math.pi / 3,
+        None, symbol="alpha", unit="rad", source="machine and ore", example="9 deg", ge=1e-3, lt=math.pi / 3
     )
+    """Nip angle: where the rolls grip the bed."""
     cake_solid_fraction: Number | None = quantity(
-        None,
-        symbol="phi_cake",
-        text="Solid fraction of the pressed cake, from which the nip angle follows",
-        source="Torres & Casali 2009",
-        example=0.85,
-        gt=0,
-        le=1,
+        None, symbol="phi_cake", source="Torres & Casali 2009", example=0.85, gt=0, le=1
     )
+    """Solid fraction of the pressed cake, from which the nip angle follows."""
 
     @classmethod
     def _impossible(cls, known: dict[str, Any]) -> Iterator[Fault]:

@@ -31,25 +31,12 @@ class PowerLawFragments(Frozen):
     """
 
     kind: Literal["power_law"] = "power_law"
-    exponent: Number = quantity(
-        1.0,
-        symbol="gamma",
-        text="Exponent of the fragment ratio: 1 is uniform, 0.3 to 0.4 usual in packed beds; 3 - fractal dimension",
-        source="ours (uniform)",
-        example=1,
-        ge=1e-3,
-        le=1e6,
-    )
+    exponent: Number = quantity(1.0, symbol="gamma", source="ours (uniform)", example=1, ge=1e-3, le=1e6)
+    """Exponent of the fragment ratio: 1 is uniform, 0.3 to 0.4 usual in packed beds; 3 - fractal dimension."""
     size_floor: Metres = quantity(
-        1e-6,
-        symbol="s_floor",
-        unit="m",
-        text="Grains below this size do not break",
-        source="ours (1 um, the grinding limit)",
-        example="1 um",
-        ge=1e-9,
-        le=1,
+        1e-6, symbol="s_floor", unit="m", source="ours (1 um, the grinding limit)", example="1 um", ge=1e-9, le=1
     )
+    """Grains below this size do not break."""
 
     def passing(self, ratio):
         """Return the probability of a fragment ratio of at most `ratio`, 0 to 1."""

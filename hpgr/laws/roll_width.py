@@ -39,32 +39,13 @@ class Parabola(Frozen):
 
     kind: Literal["parabola"] = "parabola"
     pressure_drop: Number = quantity(
-        0.8,
-        symbol="kappa",
-        text="Part of the pressure that is lost at the ends of the rolls",
-        source="Torres & Casali 2009 (1); fitted",
-        example=0.8,
-        ge=0,
-        le=1,
+        0.8, symbol="kappa", source="Torres & Casali 2009 (1); fitted", example=0.8, ge=0, le=1
     )
-    edge_share: Number = quantity(
-        0.2,
-        symbol="e",
-        text="Part of the roll width whose product is called edge product",
-        source="Torres & Casali 2009",
-        example=0.2,
-        ge=1e-3,
-        le=0.999,
-    )
-    slices: Count = quantity(
-        4,
-        symbol="N_z",
-        text="Slices of the centre, and as many of the edge, that are crushed apart",
-        source="ours",
-        example=4,
-        ge=1,
-        le=1000,
-    )
+    """Part of the pressure that is lost at the ends of the rolls."""
+    edge_share: Number = quantity(0.2, symbol="e", source="Torres & Casali 2009", example=0.2, ge=1e-3, le=0.999)
+    """Part of the roll width whose product is called edge product."""
+    slices: Count = quantity(4, symbol="N_z", source="ours", example=4, ge=1, le=1000)
+    """Slices of the centre, and as many of the edge, that are crushed apart."""
 
     def cut(self) -> Slices:
         """Return the slices, as many of the centre as of the edge."""

@@ -3,7 +3,6 @@
 from typing import Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field
 
 from hpgr.fields import Frozen, Metres, Number, Pascals, quantity
 
@@ -37,43 +36,26 @@ class SizeEffectStrength(Frozen):
         0.84e6,
         symbol="sigma_m",
         unit="Pa",
-        text="Crushing strength of a grain of the reference size",
         source="paper section 3 (quartz, 0.84 MPa)",
         example="0.84 MPa",
         ge=1,
         le=1e15,
     )
+    """Crushing strength of a grain of the reference size."""
     reference_size: Metres = quantity(
-        0.06,
-        symbol="s_m",
-        unit="m",
-        text="Grain size at which the reference strength holds",
-        source="paper section 3 (60 mm)",
-        example="60 mm",
-        ge=1e-6,
-        le=10,
+        0.06, symbol="s_m", unit="m", source="paper section 3 (60 mm)", example="60 mm", ge=1e-6, le=10
     )
+    """Grain size at which the reference strength holds."""
     weibull_modulus: Number = quantity(
-        3.04,
-        symbol="w",
-        text="Weibull modulus of grain strength; inf: strength without size effect",
-        source="paper section 3 (quartz, 3.04)",
-        example=3,
-        ge=1e-3,
-        allow_inf_nan=True,
+        3.04, symbol="w", source="paper section 3 (quartz, 3.04)", example=3, ge=1e-3, allow_inf_nan=True
     )
+    """Weibull modulus of grain strength; inf: strength without size effect."""
     cushioning: Number = quantity(
-        1.0,
-        symbol="n",
-        text="Cushioning constant: small n shields grains unlike their neighbours; inf: no cushioning",
-        source="paper eq. 2; value ours",
-        example=1,
-        ge=1e-6,
-        allow_inf_nan=True,
+        1.0, symbol="n", source="paper eq. 2; value ours", example=1, ge=1e-6, allow_inf_nan=True
     )
-    stress: Literal["mean", "major"] = Field(
-        "mean", description="Stress that crushes: 'mean' is p (the paper's figures), 'major' is p + 2 q / 3"
-    )
+    """Cushioning constant: small n shields grains unlike their neighbours; inf: no cushioning."""
+    stress: Literal["mean", "major"] = "mean"
+    """Stress that crushes: 'mean' is p (the paper's figures), 'major' is p + 2 q / 3."""
 
     def crushing_stress(self, pressure, shear_stress):
         """Return the stress that crushes, from mean stress p and triaxial shear stress q, all Pa."""
