@@ -67,7 +67,8 @@ def streams(cells, seed=0):
 def laws(w=3.04, n=1.0, gamma=1.0, reference_size=0.06, floor=1e-6):
     """Return the laws of strength and fragments by the symbols of their constants."""
     strength = Strength(weibull_modulus=w, cushioning=n, reference_size=reference_size)
-    return SimpleNamespace(strength=strength, fragments=Fragments(exponent=gamma, size_floor=floor))
+    fragments = Fragments.model_construct(exponent=gamma, size_floor=floor)  # a floor of 0 is refused elsewhere
+    return SimpleNamespace(strength=strength, fragments=fragments)
 
 
 def march(sizes, streams, log_stress, sieves=(), every=False, kernel=kernels.march, **constants):

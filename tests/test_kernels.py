@@ -4,55 +4,50 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numba import njit
 from scipy import stats
 from support import (
+    GOLDEN,
     KS,
     SIGMAS,
     critical_log_stress,
     ks_distance,
+    laws,
     line,
     march,
     plain,
     sized,
+    split_mix,
     streams,
 )
 
-from hpgr import kernels
+from hpgr.grains import kernels
 
 INF = math.inf
-GOLDEN = 0x9E3779B97F4A7C15
 MASK = 2**64 - 1
 
 
 # --- the plain reference -----------------------------------------------------------------------------------
 
 
-def split_mix(state):
-    """SplitMix64's output function in Python integers (Steele, Lea & Flood 2014)."""
-    z = ((state ^ (state >> 30)) * 0xBF58476D1CE4E5B9) & MASK
-    z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & MASK
-    return z ^ (z >> 31)
-
-
-def reference(sizes, streams, log_stress, w=3.04, n=1.0, gamma=1.0, strength_size=0.06, floor=1e-6):
-    """The march of the model page, section 4, without bounds or blocks: every cell is looked at in every step."""
+def reference(sizes, streams, log_stress, **constants):
+    """The march of the model page, section 4, by the laws' own equations: every cell is looked at in every step."""
     sizes, states, breaks, every = sizes.copy(), [int(state) for state in streams], 0, []
+    law = laws(**constants)
     for level in log_stress:
-        size = sizes.astype(float)
-        mean = (np.roll(size, 1) + np.roll(size, -1) + size) / 3
-        strength = -(3 / w) * np.log(size / strength_size) + (np.log(size / mean) / n) ** 2 / 2
-        for p in np.flatnonzero((level >= strength) & (size >= floor)):
+        breaking = (level >= law.strength.log_strength(sizes)) & (sizes.astype(float) >= law.fragments.size_floor)
+        for p in np.flatnonzero(breaking):
             states[p] = (states[p] + GOLDEN) & MASK
             uniform = ((split_mix(states[p]) >> 12) + 0.5) / 2**52
-            sizes[p] = np.float32(max(size[p] * uniform ** (1 / gamma), 1e-30))
+            sizes[p] = np.float32(max(float(sizes[p]) * float(law.fragments.quantile(uniform)), 1e-30))
             breaks += 1
         every.append(sizes.copy())
-    return sizes, np.array(states, np.uint64), breaks, np.array(every)
+    return sizes, np.array(states, np.uint64), breaks, np.array(every).reshape(-1, sizes.size)
 
 
-def same(sizes, states, history, **material):
-    found = march(sizes, states, history, every=True, **material)
-    wanted = reference(sizes, states, history, **material)
+def same(sizes, states, history, **constants):
+    found = march(sizes, states, history, every=True, **constants)
+    wanted = reference(sizes, states, history, **constants)
     return all(np.array_equal(found[k], wanted[k]) for k in range(4))
 
 
@@ -65,14 +60,12 @@ def histories(steps, seed):
     return {"rising": rising, "falling": rising[::-1], "wandering": wandering, "interrupted": interrupted}
 
 
-@pytest.mark.parametrize("cells", [1, 2, 3, 5, 16, 17, sized(1000, 100)])
-@pytest.mark.parametrize("gamma", [0.35, 1.0, 4.0])
-@pytest.mark.parametrize("w", [3.04, INF])
-@pytest.mark.parametrize("n", [0.3, 1.0, INF])
-def test_march_is_the_plain_reference_bit_for_bit(n, w, gamma, cells):
+@pytest.mark.parametrize("cells", [1, 2, 3, 16, 17, 257])
+def test_march_is_the_plain_reference_bit_for_bit(cells):
+    """Lines of less than a block, of whole blocks, and of more blocks than a vector holds."""
     sizes, states = line(cells, seed=cells)
     for history in histories(sized(40, 20), seed=cells).values():
-        assert same(sizes, states, history, n=n, w=w, gamma=gamma)
+        assert same(sizes, states, history, n=0.5, gamma=0.35)
 
 
 @pytest.mark.parametrize("w", [0.05, 1.0, 60.0, 100.0, 300.0, 700.0, 1e4, 1e8])
@@ -106,47 +99,55 @@ def test_reference_is_not_idle():
         assert 0.2 < np.mean(crushed < sizes) <= 1
 
 
+# --- vectors -----------------------------------------------------------------------------------------------
+
+
+@njit
+def listed(level, bounds, first, base, found, count):
+    return kernels._list_above(level, bounds, first, base, found, count)
+
+
+@njit
+def largest(bounds, first):
+    return kernels._largest(bounds, first)
+
+
+@given(st.lists(st.sampled_from([-1.0, 0.0, 1e-30, 0.5, 1.0, 3e38]), min_size=20, max_size=20), st.integers(0, 4))
+def test_vectors_are_their_plain_loops(values, first):
+    bounds = np.array(values, np.float32)
+    vector, loop = np.zeros(60, np.uint32), np.zeros(60, np.uint32)
+    for level in np.float32([0.0, 0.5, 3e38]):
+        count = listed(level, bounds, first, np.uint32(32), vector, 3)
+        assert count == kernels._plain_list_above(level, bounds, first, np.uint32(32), loop, 3)
+        assert np.array_equal(vector[3:count], loop[3:count])
+    assert largest(bounds, first) == kernels._plain_largest(bounds, first)
+
+
 # --- random streams ----------------------------------------------------------------------------------------
 
 
 def test_mix_is_split_mix_64():
     # published first outputs of SplitMix64 seeded with 1234567
     wanted = [6457827717110365317, 3203168211198807973, 9817491932198370423, 4593380528125082431, 16408922859458223821]
-    state, found = 1234567, []
-    for _ in wanted:
-        state = (state + GOLDEN) & MASK
-        found.append(int(kernels.mix(np.uint64(state))))
-    assert found == wanted
+    states = [(1234567 + k * GOLDEN) & MASK for k in range(1, 6)]
+    assert [int(kernels.mix(np.uint64(state))) for state in states] == [split_mix(state) for state in states] == wanted
 
 
-def test_streams_start_at_the_mix_of_base_and_cell():
-    found = np.empty(5, np.uint64)
-    kernels.start_streams(np.uint64(2**63 + 12345), found)
-    assert [int(s) for s in found] == [split_mix((2**63 + 12345 + (p + 1) * GOLDEN) & MASK) for p in range(5)]
-
-
-def test_a_cells_stream_does_not_depend_on_the_number_of_cells():
-    assert np.array_equal(streams(1000, 4)[:10], streams(10, 4))
+def test_uniforms_stay_inside_the_unit_interval(monkeypatch):
+    uniform = plain(kernels.uniform)
+    monkeypatch.setattr(kernels, "mix", lambda state: state)
+    assert uniform(np.uint64(0)) == 2.0**-53
+    assert uniform(np.uint64(MASK)) == 1 - 2.0**-53
 
 
 @pytest.mark.parametrize("gamma", [0.35, 1.0, 4.0])
-def test_fragment_ratio_follows_the_power_law(gamma):
-    """Fails by chance once in a million (KS)."""
+def test_fragments_follow_their_law(gamma):
+    """One break of each of many equal cells. Fails by chance once in a million (KS)."""
     samples = sized(20_000, 2_000)
-    found = [kernels.fragment_ratio(state, 1 / gamma) for state in streams(samples, 11)]
-    assert ks_distance(found, lambda x: x**gamma) < KS / math.sqrt(samples)
-
-
-def test_fragment_ratio_is_neither_0_nor_1():
-    for state in [np.uint64(k) for k in (0, 1, 2**63, MASK)]:
-        assert 0 < kernels.fragment_ratio(state, 1.0) < 1
-
-
-def test_extreme_uniforms_stay_inside_the_unit_interval(monkeypatch):
-    ratio = plain(kernels.fragment_ratio)
-    monkeypatch.setattr(kernels, "mix", lambda state: state)
-    assert ratio(np.uint64(0), 1.0) == 2.0**-53
-    assert ratio(np.uint64(MASK), 1.0) == 1 - 2.0**-53
+    sizes = np.full(samples, 0.5, np.float32)
+    found, _, breaks = march(sizes, streams(samples, 11), [10.0], n=INF, gamma=gamma)
+    assert breaks == samples
+    assert ks_distance(found / sizes, laws(gamma=gamma).fragments.passing) < KS / math.sqrt(samples)
 
 
 # --- exact results of the model page, section 9 ------------------------------------------------------------
@@ -158,13 +159,9 @@ def single(cells, size, seed):
 
 def break_counts(before, after, most=200):
     """Number of breaks of every cell, from how often its stream has moved on."""
-    counts = np.full(before.size, -1)
-    state = before.copy()
-    for k in range(most):
-        counts[state == after] = k
-        state += np.uint64(GOLDEN)
-    assert np.all(counts >= 0)
-    return counts
+    states = before[:, None] + np.arange(most, dtype=np.uint64) * np.uint64(GOLDEN)
+    assert np.all((states == after[:, None]).sum(axis=1) == 1)
+    return (states == after[:, None]).argmax(axis=1)
 
 
 @pytest.mark.parametrize("gamma", [0.35, 1.0, 4.0])
@@ -249,9 +246,12 @@ def test_a6_equal_strengths_break_in_step(gamma, attempts):
 
 
 def half_every_time(monkeypatch):
-    """Run the real march and crush in Python with X = 1/2."""
-    monkeypatch.setattr(kernels, "fragment_ratio", lambda state, inverse_gamma: 0.5)
-    monkeypatch.setattr(kernels, "crush", plain(kernels.crush))
+    """Run the real march in Python with X = 1/2."""
+    monkeypatch.setattr(kernels, "uniform", lambda state: 0.5)
+    monkeypatch.setattr(kernels, "_list_above", kernels._plain_list_above)
+    monkeypatch.setattr(kernels, "_largest", kernels._plain_largest)
+    for name in ("crush", "set_bounds", "_list_candidates", "_renew_blocks", "_break"):
+        monkeypatch.setattr(kernels, name, plain(getattr(kernels, name)))
     return plain(kernels.march)
 
 
@@ -305,7 +305,7 @@ def test_sizes_times_4_with_their_scale_give_sizes_times_4(n):
     sizes, states = line(200, seed=31)
     for history in histories(40, seed=31).values():
         small = march(sizes, states, history, n=n)
-        large = march(4 * sizes, states, history, n=n, strength_size=4 * 0.06, floor=4e-6)
+        large = march(4 * sizes, states, history, n=n, reference_size=4 * 0.06, floor=4e-6)
         assert np.array_equal(large[0], 4 * small[0])
         assert np.array_equal(large[1], small[1])
 

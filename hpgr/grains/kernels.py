@@ -312,8 +312,8 @@ def workspace(cells):
     return Work(
         np.empty(most, np.uint32),
         np.empty(most, np.uint32),
-        np.empty(most, np.float32),
-        np.empty(most),
+        np.ones(most, np.float32),
+        np.ones(most),
         np.empty(most, np.float32),
         np.empty(most, np.uint8),
         np.empty(most, np.uint8),
@@ -392,7 +392,7 @@ def _decide_by_logarithms(candidates, sizes, totals, ore, log_stress, bounds, br
 def _list_breaks(candidates, found_bounds, breaks, bounds, places):
     """Store the bounds found and leave in `places` those that break; return their number."""
     # without branches: a mispredicted one costs more than the store
-    found = 0
+    found = np.int64(0)
     for k in range(candidates):
         p = places[k]
         bounds[np.uint64(p)] = found_bounds[k]

@@ -1,0 +1,62 @@
+"""Laws of strength, fragments and exchange against arithmetic done by hand."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hpgr.laws.exchange import Exchange
+from hpgr.laws.fragments import Fragments
+from hpgr.laws.strength import Strength
+
+INF = math.inf
+
+
+def test_strength_by_hand():
+    """Eq. 2: of cells 2, 1, 6 mm and so on the mean beside the second is 3 mm."""
+    law = Strength(reference_size=0.004, weibull_modulus=1.5, cushioning=2.0)
+    found = law.log_strength(np.array([0.002, 0.001, 0.006, 0.004]))
+    assert found[1] == pytest.approx(2 * math.log(4) + (math.log(3) / 2) ** 2 / 2)
+    assert found[3] == pytest.approx(0.0)  # the reference size beside 2 and 6 mm, whose mean it is
+    assert law.log_strength([[0.002]]) == pytest.approx(2 * math.log(2))  # its own neighbour on both sides
+
+
+@given(st.lists(st.floats(1e-4, 0.06), min_size=1, max_size=8), st.floats(0.3, 5))
+def test_cushioning_only_strengthens_and_by_a_bounded_factor_among_finer_grains(sizes, cushioning):
+    cushioned, plain = (Strength(cushioning=n).log_strength(sizes) for n in (cushioning, INF))
+    assert np.all(cushioned >= plain)
+    largest = np.argmax(sizes)
+    assert cushioned[largest] <= plain[largest] + math.log(3) ** 2 / (2 * cushioning**2) + 1e-9
+
+
+@pytest.mark.parametrize("w", [1.0, 3.04, 30.0])
+def test_critical_size_is_where_strength_meets_stress(w):
+    law = Strength(weibull_modulus=w, cushioning=INF)
+    levels = np.array([-1.0, 0.0, 1.5, 3.4])
+    assert law.log_strength(law.critical_size(levels)[:, None])[:, 0] == pytest.approx(levels, abs=1e-12)
+    assert law.critical_size_ratio(levels) == pytest.approx(law.critical_size(levels) / law.reference_size)
+    assert law.critical_size(-INF) == law.critical_size_ratio(np.float64(-INF)) == INF
+
+
+def test_stress_that_crushes():
+    """Mean p, or major p + 2 q / 3; the log is over the reference strength, and none breaks nothing."""
+    assert Strength().crushing_stress(3.0, 6.0) == 3.0
+    assert Strength(stress="major").crushing_stress(3.0, 6.0) == 7.0
+    assert Strength(reference_strength=2.0).log_stress(np.array([0.0, 2.0, 2 * math.e])).tolist() == [-INF, 0.0, 1.0]
+
+
+def test_fragments_by_hand_and_back():
+    law = Fragments(exponent=0.5)
+    assert law.passing([0.04, 0.25, 1.0]) == pytest.approx([0.2, 0.5, 1.0])
+    ratios = np.linspace(0.01, 1, 20)
+    assert law.quantile(law.passing(ratios)) == pytest.approx(ratios)
+
+
+def test_exchange_is_proportional_to_its_coefficients():
+    law = Exchange(segregation=0.2, mixing=0.3)
+    assert law.percolation(5.0, 0.5, 4.0) == pytest.approx(0.2 * 5 * 0.5 / 4)
+    assert law.diffusion(5.0, 0.1, 4.0) == pytest.approx(0.3 * 5 / (0.1 * 4))
+    still = Exchange(segregation=0, mixing=0)
+    assert still.percolation(5.0, 0.5, 4.0) == still.diffusion(5.0, 0.1, 4.0) == 0
