@@ -427,7 +427,7 @@ def _driver(path: Path, now: float) -> Driver | None:
         silence = now - path.stat().st_mtime
         told = json.loads(first)
         words = f"process {told['process']} on {told['host']}, at work since {told['since']}"
-    except (OSError, ValueError, TypeError, KeyError):
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
         return None
     return Driver(f"{words}, last sign of life {max(silence, 0):.0f} s ago", set(claimed), silence)
 
