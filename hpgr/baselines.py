@@ -166,22 +166,16 @@ class Fit(NamedTuple):
 
 
 class _Search(NamedTuple):
-    bounds: dict[str, tuple[float, float]]  # lowest and highest value that a fit may take
+    low: Any  # lowest and highest value that a fit may take
+    high: Any
     starts: tuple  # the published porphyry first; the others around it
     of_edges: set[str]  # parameters that the total alone does not tell
 
 
 _SEARCHES = {
     TorresCasali: _Search(
-        {
-            "fine_share": (1e-6, 1.0),
-            "fine_exponent": (0.01, 5.0),
-            "coarse_exponent": (0.5, 30.0),
-            "selection": (1e-7, 1e-1),
-            "slope": (-2.0, 5.0),
-            "curvature": (-2.0, 0.3),
-            "edge_share": (0.01, 0.6),
-        },
+        TorresCasali(1e-6, 0.01, 0.5, 1e-7, -2.0, -2.0, 0.01),
+        TorresCasali(1.0, 5.0, 30.0, 1e-1, 5.0, 0.3, 0.6),
         (
             TorresCasali(0.20, 0.20, 3.51, 0.66 / 3600, -1.26, -0.70, 0.22),
             TorresCasali(0.40, 0.40, 3.0, 1.0 / 3600, 0.0, -0.1, 0.2),
@@ -191,14 +185,8 @@ _SEARCHES = {
         {"edge_share"},
     ),
     HindeKalala: _Search(
-        {
-            "rate": (1e-7, 1e-1),
-            "exponent": (0.01, 5.0),
-            "bend": (0.0, 1.0),
-            "coarse_exponent": (0.1, 10.0),
-            "edge_share": (0.01, 0.6),
-            "edge_energy": (0.01, 1.0),
-        },
+        HindeKalala(1e-7, 0.01, 0.0, 0.1, 0.01, 0.01),
+        HindeKalala(1e-1, 5.0, 1.0, 10.0, 0.6, 1.0),
         (
             HindeKalala(2.0 / 3600, 0.4, 0.5, 2.0, 0.2, 0.5),
             HindeKalala(5.0 / 3600, 0.6, 0.9, 3.0, 0.15, 0.3),
@@ -422,32 +410,33 @@ def decay(parameters: HindeKalala, sizes: np.ndarray, reference_size: float) -> 
 
 def _least_squares(model, tests, kind, fixed: dict[str, float]) -> Fit:
     """Return the best fit over all starts."""
-    bounds, starts, _ = _SEARCHES[kind]
+    search = _SEARCHES[kind]
     free = [name for name in kind._fields if name not in fixed]
 
     def parameters(vector):
         pairs = zip(free, vector, strict=True)
         return kind(**{name: math.exp(x) if name in _LOGARITHMIC else float(x) for name, x in pairs}, **fixed)
 
-    def coordinates(values):
-        return [math.log(values[name]) if name in _LOGARITHMIC else values[name] for name in free]
+    def place_of(values):
+        return [math.log(getattr(values, n)) if n in _LOGARITHMIC else getattr(values, n) for n in free]
 
     def residuals(vector):
         found = parameters(vector)
         return np.concatenate([_differences(model.predict(found, test), test) for test in tests])
 
-    ends = tuple(coordinates({name: bound[side] for name, bound in bounds.items()}) for side in (0, 1))
+    ends = (place_of(search.low), place_of(search.high))
     options = {"bounds": ends, "x_scale": "jac", "xtol": 1e-10, "ftol": 1e-10, "max_nfev": _EVALUATIONS}
-    fits = [optimize.least_squares(residuals, coordinates(start._asdict()), **options) for start in starts if free]
+    fits = [optimize.least_squares(residuals, place_of(start), **options) for start in search.starts if free]
     best = min(fits, key=lambda fit: fit.cost, default=None)
     place, settled = ([], True) if best is None else (best.x, best.status > 0)
     found = parameters(place)
-    stopped = tuple(
-        name
-        for name in free
-        if any(math.isclose(getattr(found, name), end, rel_tol=1e-3, abs_tol=1e-6) for end in bounds[name])
-    )
-    return Fit(model, found, float(np.sqrt(np.mean(residuals(place) ** 2))), stopped, settled)
+    rmse = float(np.sqrt(np.mean(residuals(place) ** 2)))
+    return Fit(model, found, rmse, tuple(name for name in free if _at_bound(found, name)), settled)
+
+
+def _at_bound(found: Any, name: str) -> bool:
+    ends = (getattr(end, name) for end in _SEARCHES[type(found)][:2])
+    return any(math.isclose(getattr(found, name), end, rel_tol=1e-3, abs_tol=1e-6) for end in ends)
 
 
 def _differences(prediction: Prediction, test: PilotTest) -> np.ndarray:
@@ -480,18 +469,19 @@ def _machine_faults(machine: Machine) -> list[str]:
 
 def _fit_faults(tests: Sequence[PilotTest], kind: Any, fixed: Mapping[str, float]) -> Iterator[str]:
     """Yield why parameters of `kind` cannot be fitted to `tests`."""
-    bounds, _, of_edges = _SEARCHES[kind]
+    search = _SEARCHES[kind]
     for name, value in fixed.items():
         if name not in kind._fields:
             close = difflib.get_close_matches(name, kind._fields, n=1, cutoff=0.3) or [kind._fields[0]]
             yield f"fixed: got {name!r}; must be one of {', '.join(kind._fields)}; did you mean {close[0]!r}?"
-        elif not bounds[name][0] <= value <= bounds[name][1]:
-            low, high = bounds[name]
+            continue
+        low, high = getattr(search.low, name), getattr(search.high, name)
+        if not low <= value <= high:
             yield f"fixed {name}: got {value:g}; must be within {low:g} and {high:g}; correct it"
     if not tests:
         yield "tests: got none; a fit needs at least one; give those to calibrate on"
         return
-    missing = [name for name in kind._fields if name in of_edges - fixed.keys()]
+    missing = [name for name in kind._fields if name in search.of_edges - fixed.keys()]
     if missing and not any(np.isfinite(test.centre).any() or np.isfinite(test.edge).any() for test in tests):
         yield (
             f"tests: got no centre or edge product; {' and '.join(missing)} cannot be fitted to the total alone; "
