@@ -3,34 +3,36 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from support import KS, SIGMAS, crush, feed_values, first_cells, paper, sized
+from support import KS, SIGMAS, crush, first_cells, paper, sized
 
-from hpgr import feed, flow, geometry, kernels, limits, presets, simulate, solve, stress
+from hpgr import presets, simulate
+from hpgr.bed.loaded import inputs_of, load_bed
+from hpgr.grains import kernels, march, solve
+from hpgr.grains.closed_form import crushed_passing
 
 INF = math.inf
 NO_CUSHION = 1e9  # as good as inf, for which the closed form would take over
 
 
 def load(scene, points=61):
-    bed = geometry.bed(scene.rolls, scene.resolution.streamlines)
-    motion = flow.move(scene, bed, points)
-    return stress.crushing_stress(scene, motion, stress.load(scene, motion))
+    scene = scene.with_values({"resolution.points": points})
+    return solve.crushing_stress(scene, load_bed(inputs_of(scene)))
 
 
 @pytest.mark.parametrize(
     ("values", "solver"),
     [
         ({"resolution.cells": 0}, "stress only"),
-        ({"resolution.cells": 0, "material.cushioning": INF, "resolution.record": "product"}, "stress only"),
+        ({"resolution.cells": 0, "strength.cushioning": INF, "resolution.record": "product"}, "stress only"),
         ({}, "march"),
-        ({"material.cushioning": INF}, "march"),  # cells are wanted
-        ({"material.cushioning": INF, "resolution.record": "product"}, "closed form"),
-        ({"material.cushioning": INF, "resolution.record": "distributions"}, "closed form"),
+        ({"strength.cushioning": INF}, "march"),  # cells are wanted
+        ({"strength.cushioning": INF, "resolution.record": "product"}, "closed form"),
+        ({"strength.cushioning": INF, "resolution.record": "distributions"}, "closed form"),
         (
-            {"material.cushioning": INF, "material.weibull_modulus": INF, "resolution.record": "product"},
+            {"strength.cushioning": INF, "strength.weibull_modulus": INF, "resolution.record": "product"},
             "march",  # without size effect there is no critical size
         ),
-        ({"material.cushioning": 100.0, "resolution.record": "product"}, "march"),
+        ({"strength.cushioning": 100.0, "resolution.record": "product"}, "march"),
     ],
 )
 def test_the_cheapest_solver_is_chosen_and_told(values, solver):
@@ -43,9 +45,9 @@ def test_closed_form_draws_no_cells(monkeypatch):
     def refuse(*args, **kwargs):
         raise AssertionError("cell work")
 
-    monkeypatch.setattr(kernels, "march_parcels", refuse)
-    monkeypatch.setattr(feed, "quantile", refuse)
-    scene = paper({"material.cushioning": INF, "resolution.record": "product"})
+    monkeypatch.setattr(kernels, "march", refuse)
+    monkeypatch.setattr(kernels, "start_parcels", refuse)
+    scene = paper({"strength.cushioning": INF, "resolution.record": "product"})
     assert simulate(scene)["p80_total"] > 0
     with pytest.raises(AssertionError, match="cell work"):
         simulate(paper())
@@ -55,26 +57,26 @@ def test_closed_form_draws_no_cells(monkeypatch):
 def test_closed_form_is_the_limit_of_the_march(gamma):
     """KS at 1e-6 on every sieve, plus 0.5 % for grains that the last steps before the peak leave unfinished."""
     cells = sized(50_000, 1_000)
-    closed = paper({"material.cushioning": INF, "material.fragment_exponent": gamma, "resolution.record": "product"})
-    marched = closed.with_values({"material.cushioning": NO_CUSHION, "resolution.cells": cells})
+    closed = paper({"strength.cushioning": INF, "fragments.exponent": gamma, "resolution.record": "product"})
+    marched = closed.with_values({"strength.cushioning": NO_CUSHION, "resolution.cells": cells})
     history = load(closed, 1601)
     exact, found = crush(closed, history, 0, 0), crush(marched, history, 0, 0)
     assert np.max(np.abs(found.passing - exact.passing)) < 0.005 + KS / math.sqrt(cells)
     # breaks scatter like a Poisson number, percentiles in passing like a binomial one
     assert found.breaks == pytest.approx(exact.breaks, abs=0.02 + SIGMAS * math.sqrt(4 / cells))
     for fraction, size in zip((0.5, 0.8), found.total_percentiles, strict=True):
-        critical = limits.critical_size(np.log(history.max(axis=1) / 0.84e6), closed.material)
-        there = limits.crushed_passing(closed.feed, float(size), critical, gamma).mean()
+        critical = closed.strength.critical_size(np.log(history.max(axis=1) / 0.84e6))
+        there = crushed_passing(closed.feed, float(size), critical, gamma).mean()
         assert abs(there - fraction) < 0.005 + SIGMAS * math.sqrt(fraction * (1 - fraction) / (3 * cells))
 
 
 def test_total_percentiles_are_those_of_the_mixture():
-    scene = paper({"material.cushioning": INF, "resolution.record": "product"})
+    scene = paper({"strength.cushioning": INF, "resolution.record": "product"})
     history = load(scene)
     found = crush(scene, history, 0, 0)
-    critical = limits.critical_size(np.log(history.max(axis=1) / 0.84e6), scene.material)
+    critical = scene.strength.critical_size(np.log(history.max(axis=1) / 0.84e6))
     for fraction, size in zip((0.5, 0.8), found.total_percentiles, strict=True):
-        mixture = limits.crushed_passing(scene.feed, size, critical, 1.0).mean()
+        mixture = crushed_passing(scene.feed, size, critical, 1.0).mean()
         assert mixture == pytest.approx(fraction, rel=1e-9)
     assert np.all(found.percentiles[:, 0] < found.total_percentiles)
     assert np.all(found.total_percentiles < found.percentiles[:, -1])
@@ -82,7 +84,7 @@ def test_total_percentiles_are_those_of_the_mixture():
 
 def test_closed_form_distributions_are_cumulative_along_the_path():
     """A4: at every point the smallest critical size met so far decides, also past the peak."""
-    scene = paper({"material.cushioning": INF, "resolution.record": "distributions"})
+    scene = paper({"strength.cushioning": INF, "resolution.record": "distributions"})
     found = crush(scene, load(scene), 0, 0)
     passing = np.cumsum(found.mass_fraction[0], axis=-1)
     assert np.all(np.diff(passing, axis=1) >= -1e-12)
@@ -90,8 +92,8 @@ def test_closed_form_distributions_are_cumulative_along_the_path():
 
 
 def test_a_streamline_does_not_depend_on_the_others():
-    """Keyed by (replicate, streamline, photograph): the first streamlines of many are those of few, bit for bit."""
-    scene = paper({"resolution.photographs": 2})
+    """Keyed by (replicate, streamline, snapshot): the first streamlines of many are those of few, bit for bit."""
+    scene = paper({"resolution.snapshots": 2})
     history = load(scene)
     whole = crush(scene, history, 3, 1)
     for count in (1, 2):
@@ -112,8 +114,8 @@ def test_streamlines_under_the_same_stress_are_independent():
         assert np.intersect1d(product[first], product[second]).size < 5
 
 
-def test_a_photograph_does_not_depend_on_the_others():
-    scene = paper({"resolution.photographs": 3})
+def test_a_snapshot_does_not_depend_on_the_others():
+    scene = paper({"resolution.snapshots": 3})
     history = load(scene)
     three = crush(scene, history, 3, 1).size
     one = crush(paper(), history, 3, 1).size
@@ -121,29 +123,27 @@ def test_a_photograph_does_not_depend_on_the_others():
 
 
 def test_keys_tell_every_parcel_apart():
+    """The package's parcels are those of plain Python, and no two of them share a stream."""
     scene = paper({"resolution.cells": 500})
     keys = [(0, (0, 0, 0)), (1, (0, 0, 0)), (0, (1, 0, 0)), (0, (0, 1, 0)), (0, (0, 0, 1)), (2**64, (0, 0, 0))]
-    parcels = [first_cells(scene, seed, key) for seed, key in keys]
-    for k, (sizes, streams) in enumerate(parcels):
-        for other_sizes, other_streams in parcels[:k]:
-            assert not np.array_equal(sizes, other_sizes)
-            assert np.intersect1d(streams, other_streams).size == 0
-    again = first_cells(scene, 0, (0, 0, 0))
-    assert np.array_equal(parcels[0][0], again[0])
-    assert np.array_equal(parcels[0][1], again[1])
-    assert parcels[0][0].dtype == np.float32
-    assert parcels[0][1].dtype == np.uint64
-    assert np.unique(parcels[0][1]).size == 500
+    parcels = [march.first_cells(scene, seed, [key]) for seed, key in keys]
+    for (seed, key), (sizes, streams) in zip(keys, parcels, strict=True):
+        wanted = first_cells(scene, seed, key)
+        assert np.array_equal(sizes[0, 1:-1], wanted[0])
+        assert np.array_equal(streams[0, 1:-1], wanted[1])
+        assert sizes.dtype == np.float32
+    assert len({row.tobytes() for row, _ in parcels}) == len(keys)
+    assert np.unique([streams[0, 1:-1] for _, streams in parcels]).size == 500 * len(keys)
 
 
 def test_a_feed_from_zero_holds_no_grain_of_size_zero():
-    scene = paper(feed_values(kind="power_law", top_size=0.06, exponent=0.1) | {"resolution.cells": 5000})
-    sizes, _ = first_cells(scene, 0, (0, 0, 0))
-    assert sizes.min() >= np.float32(kernels.SMALLEST)
+    scene = paper({"feed": {"kind": "power_law", "top_size": 0.06, "exponent": 0.1}, "resolution.cells": 5000})
+    sizes, _ = march.first_cells(scene, 0, [(0, 0, 0)])
+    assert sizes[:, 1:-1].min() >= np.float32(kernels.SMALLEST)
 
 
 def test_summaries_are_those_of_the_recorded_cells():
-    scene = paper({"resolution.photographs": 2, "material.size_floor": "1 mm"})
+    scene = paper({"resolution.snapshots": 2, "fragments.size_floor": "1 mm"})
     found = crush(scene, load(scene), 0, 0)
     product = found.size[:, :, -1].transpose(1, 0, 2).reshape(3, -1).astype(float)
     assert found.percentiles == pytest.approx(np.quantile(product, [0.5, 0.8], axis=1), rel=1e-6)
@@ -181,7 +181,7 @@ def test_converged_figures_of_the_papers_machine(n):
     """5 sigma of both programs' sampling, and the rounding of the printed figures."""
     cells = sized(100_000, 1_000)
     scene = paper(
-        {"material.cushioning": min(n, NO_CUSHION), "resolution.cells": cells, "resolution.record": "product"}
+        {"strength.cushioning": min(n, NO_CUSHION), "resolution.cells": cells, "resolution.record": "product"}
     )
     found = crush(scene, machine_history(1601), 71, 0)
     p50, p80, breaks = REFERENCE[n]
@@ -195,7 +195,7 @@ def test_converged_figures_of_the_papers_machine(n):
 def test_strong_cushioning_needs_small_time_steps():
     """n = 1/2: P80 at xi = 0.05 still moves with dt. 5 sigma of sampling and the rounding of the figures."""
     cells = sized(100_000, 2_000)
-    scene = paper({"material.cushioning": 0.5, "resolution.cells": cells, "resolution.record": "product"})
+    scene = paper({"strength.cushioning": 0.5, "resolution.cells": cells, "resolution.record": "product"})
     found = []
     figures = sized({101: 2.29, 201: 2.47, 401: 2.61, 801: 2.69, 1601: 2.75}, {101: 2.29, 401: 2.61})
     for points, figure in figures.items():
@@ -207,9 +207,9 @@ def test_strong_cushioning_needs_small_time_steps():
 
 
 def test_large_case_marched_on_all_cores_or_one_by_one_has_the_same_bits(monkeypatch):
-    scene = paper({"resolution.photographs": 2, "resolution.record": "distributions"})
+    scene = paper({"resolution.snapshots": 2, "resolution.record": "distributions"})
     at_once = crush(scene, load(scene), 5, 1)
-    monkeypatch.setattr(solve, "_LARGE", 1)
+    monkeypatch.setattr(march, "_LARGE", 1)
     on_all_cores = crush(scene, load(scene), 5, 1)
     with ThreadPoolExecutor(1) as pool:  # a worker thread of a study
         one_by_one = pool.submit(crush, scene, load(scene), 5, 1).result()

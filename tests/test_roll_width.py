@@ -3,13 +3,14 @@ import math
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from support import SIGMAS, feed_values, paper, sized
+from support import SIGMAS, sized
 
-from hpgr import presets, simulate, width
+from hpgr import presets, simulate
+from hpgr.laws.roll_width import WHOLE, Parabola
 
 INF = math.inf
 PRODUCT = {"resolution.record": "product", "resolution.points": 61, "resolution.streamlines": 3}
-CLOSED = {"material.cushioning": INF}
+CLOSED = {"strength.cushioning": INF}
 
 
 def pilot(values=None, **fields):
@@ -17,45 +18,40 @@ def pilot(values=None, **fields):
     return presets.khd_pilot().with_values(PRODUCT | {"roll_width": fields} | (values or {}))
 
 
-@pytest.mark.parametrize("slices", [1, 4, 7])
-@pytest.mark.parametrize("edge_share", [0.05, 0.2, 0.9])
-def test_slices_share_the_width(slices, edge_share):
-    found = width.slices_of(pilot(slices=slices, edge_share=edge_share))
-    assert found.share.sum() == pytest.approx(1, rel=1e-14)
-    assert found.share[found.at_edge].sum() == pytest.approx(edge_share, rel=1e-14)
-    assert np.count_nonzero(found.at_edge) == np.count_nonzero(~found.at_edge) == slices
-    assert np.all(np.diff(found.position) > 0)
-    assert 0 < found.position[0] < found.position[-1] < 1
-    assert np.all((found.position > 1 - edge_share) == found.at_edge)
-    # a slice is as wide as its share: its middle lies half its share past those before it
-    assert found.position == pytest.approx(np.cumsum(found.share) - found.share / 2, rel=1e-14)
+def test_slices_share_the_width():
+    for slices, edge_share in ((1, 0.05), (4, 0.2), (7, 0.9)):
+        found = Parabola(slices=slices, edge_share=edge_share).cut()
+        assert found.share.sum() == pytest.approx(1, rel=1e-14)
+        assert found.share[found.at_edge].sum() == pytest.approx(edge_share, rel=1e-14)
+        assert np.count_nonzero(found.at_edge) == np.count_nonzero(~found.at_edge) == slices
+        assert np.all((found.position > 1 - edge_share) == found.at_edge)
+        # a slice is as wide as its share: its middle lies half its share past those before it
+        assert found.position == pytest.approx(np.cumsum(found.share) - found.share / 2, rel=1e-14)
+    assert [part.tolist() for part in WHOLE] == [[0], [1], [1], [False]]
 
 
 def test_pressure_is_the_parabola_and_its_mean():
-    found = width.slices_of(pilot(pressure_drop=0.8, slices=4))
-    assert found.pressure == pytest.approx(1 - 0.8 * found.position**2, rel=1e-14)
     means = []
     for slices in (4, 8, 16):
-        scene = pilot(pressure_drop=0.8, slices=slices)
-        found = width.slices_of(scene)
-        means.append(abs(found.share @ found.pressure - width.mean_pressure(scene)))
-    assert width.mean_pressure(scene) == pytest.approx(1 - 0.8 / 3, rel=1e-14)
+        law = Parabola(pressure_drop=0.8, slices=slices)
+        found = law.cut()
+        assert found.pressure == pytest.approx(1 - 0.8 * found.position**2, rel=1e-14)
+        means.append(abs(found.share @ found.pressure - law.mean_pressure()))
+    assert law.mean_pressure() == pytest.approx(1 - 0.8 / 3, rel=1e-14)
     assert means[0] < 0.01
     assert np.array(means[:-1]) / means[1:] == pytest.approx(4, rel=1e-6)  # midpoint rule of a parabola
-    assert width.mean_pressure(paper()) == 1
-    assert [part.tolist() for part in width.slices_of(paper())] == [[0], [1], [1], [False]]
 
 
 @pytest.mark.parametrize("cushioning", [1.0, INF])
 def test_no_drop_is_the_scene_without_roll_width(cushioning):
     """Every slice then marches the same cells under the same stress: equal bits, but for rounding of shares."""
-    small = {"material.cushioning": cushioning, "resolution.cells": 200}
+    small = {"strength.cushioning": cushioning, "resolution.cells": 200}
     sliced = simulate(pilot(small, pressure_drop=0.0, slices=2))
     plain = simulate(presets.khd_pilot().with_values(PRODUCT | small))
     for row in sliced["passing_slice"].values:
         assert np.array_equal(row, plain["passing_total"])
     for name in ("passing_width_centre", "passing_width_edge", "passing_total", "passing"):
-        assert sliced[name.replace("_width_centre", "_width_centre")].values == pytest.approx(
+        assert sliced[name].values == pytest.approx(
             plain["passing" if name == "passing" else "passing_total"].values, abs=2e-7
         )
     for name in ("pressing_force", "power", "throughput", "pressure"):
@@ -68,7 +64,7 @@ def test_no_drop_is_the_scene_without_roll_width(cushioning):
 
 @pytest.mark.parametrize("cushioning", [0.6, INF])
 def test_total_is_centre_and_edge_in_their_shares(cushioning):
-    found = simulate(pilot(CLOSED | {"material.cushioning": cushioning, "resolution.cells": 200}, edge_share=0.3))
+    found = simulate(pilot(CLOSED | {"strength.cushioning": cushioning, "resolution.cells": 200}, edge_share=0.3))
     parts = 0.7 * found["passing_width_centre"] + 0.3 * found["passing_width_edge"]
     assert found["passing_total"].values == pytest.approx(parts.values, abs=1e-6)
     assert found["passing"].mean("streamline").values == pytest.approx(found["passing_total"].values, abs=1e-6)
@@ -82,8 +78,8 @@ def test_total_is_centre_and_edge_in_their_shares(cushioning):
 
 FEEDS = {
     "table": {},
-    "single": feed_values(kind="single", size=0.03),
-    "power law": feed_values(kind="power_law", top_size=0.03, exponent=0.7),
+    "single": {"feed": {"kind": "single", "size": 0.03}},
+    "power law": {"feed": {"kind": "power_law", "top_size": 0.03, "exponent": 0.7}},
 }
 
 
@@ -104,7 +100,7 @@ def test_sampling_of_slices_agrees_with_the_closed_form(feed):
     same cells: |deviation| > 5 sigma once in 1.7 million, at fewer than 200 sieves and zones."""
     cells = sized(4000, 300)
     small = feed | {"resolution.cells": cells, "resolution.points": 31}
-    marched = simulate(pilot(small | {"material.cushioning": 100.0}, pressure_drop=0.9, slices=2))
+    marched = simulate(pilot(small | {"strength.cushioning": 100.0}, pressure_drop=0.9, slices=2))
     exact = simulate(pilot(small | CLOSED, pressure_drop=0.9, slices=2))
     assert (marched.attrs["solver"], exact.attrs["solver"]) == ("march", "closed form")
     for name in ("passing_total", "passing_width_centre", "passing_width_edge"):
