@@ -80,12 +80,13 @@ def test_address_is_the_same_in_another_process():
 def test_code_version_changes_with_the_code_though_the_version_does_not(tmp_path, monkeypatch, file):
     copy = tmp_path / "hpgr"
     shutil.copytree(Path(hpgr.__file__).parent, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    own = code_version.__wrapped__()
     monkeypatch.setattr(hpgr, "__file__", str(copy / "__init__.py"))
-    assert code_version.__wrapped__() == code_version()
+    assert code_version.__wrapped__() == own
     content = bytearray((copy / file).read_bytes())
     content[len(content) // 2] ^= 1
     (copy / file).write_bytes(content)
-    assert code_version.__wrapped__() != code_version()
+    assert code_version.__wrapped__() != own
 
 
 def test_code_version_changes_with_a_library(monkeypatch):
@@ -279,7 +280,7 @@ def test_cases_of_a_driver_that_gives_no_sign_of_life_are_taken_over(tmp_path, m
         assert other.claim(B)
         stopped.put(A, result(1))  # it was not dead after all
         other.put(A, result(1))
-    assert addresses(tmp_path) == [A]
+    assert set(addresses(tmp_path)) == {A}  # twice, and the same
     assert not list(tmp_path.glob(".hpgr-*"))
 
 

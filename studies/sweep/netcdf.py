@@ -231,6 +231,8 @@ def read_variable(path: str | Path, name: str, address: str | None = None) -> np
     with _opened(path) as file:
         if address is not None and getattr(file, "address", None) != address:
             raise ValueError(f"{path}: is not the case that its name tells; run the sweep again")
+        if name not in file.variables:
+            raise ValueError(f"{path}: has no variable {name!r}; give a file that a study has written")
         file.set_auto_mask(False)
         return np.asarray(file[name][...])
 
