@@ -6,9 +6,10 @@ import pytest
 import xarray as xr
 from support import paper
 
-from hpgr.schema import FLAGS
-from studies import report
-from studies.sweep import STATUS, sweep
+from hpgr.results.flags import BITS
+from hpgr.results.schema import STATUS
+from studies.show import report
+from studies.sweep import sweep
 
 
 @pytest.fixture(scope="module")
@@ -36,96 +37,77 @@ def replicates(*values):
     return xr.DataArray(np.array(values), dims="replicate")
 
 
-def sieved(*rows):
-    """A result of sieves 1, 10 and 100 mm."""
-    total = xr.DataArray(np.array(rows), dims=("gap", "sieve"), coords={"sieve": [1e-3, 1e-2, 1e-1]})
-    return xr.Dataset({"passing_total": total, "passing": total.expand_dims(streamline=2) * [[[1.0]], [[0.5]]]})
+def test_aligned_columns_and_markdown():
+    rows = [["a", "1.5"], ["long name", "-12"]]
+    assert report.aligned(["what", "x"], rows, words=1) == "what         x\na          1.5\nlong name  -12"
+    assert report.aligned(["what", "x"], rows, markdown=True).splitlines()[:3] == [
+        "| what | x |",
+        "| --- | ---: |",
+        "| a | 1.5 |",
+    ]
 
 
 def test_percent_passing_by_hand():
-    result = sieved([0.2, 0.6, 1.0], [0.0, 0.5, 0.9])
-    # sqrt(10) mm is half way from 1 to 10 mm in the log
-    assert report.percent_passing(result, math.sqrt(10) * 1e-3).values == pytest.approx([40, 25], rel=1e-12)
-    assert report.percent_passing(result, 1e-2).values == pytest.approx([60, 50], rel=1e-12)
-    assert report.percent_passing(result, 1e-3).values == pytest.approx([20, 0], abs=1e-12)
-    assert report.percent_passing(result, 1e-1).values == pytest.approx([100, 90], rel=1e-12)
-    quarter = 10 ** (1.25 - 3)  # a quarter of the way from 10 to 100 mm
-    assert report.percent_passing(result, quarter).values == pytest.approx([70, 60], rel=1e-12)
-
-
-def test_percent_passing_per_streamline():
-    found = report.percent_passing(sieved([0.2, 0.6, 1.0]), 1e-2, total=False)
+    """Sieves of 1, 10 and 100 mm; the second case is lost."""
+    rows = np.array([[0.2, 0.6, 1.0], [np.nan] * 3])
+    total = xr.DataArray(rows, dims=("gap", "sieve"), coords={"sieve": [1e-3, 1e-2, 1e-1]})
+    result = xr.Dataset({"passing_total": total, "passing": total.expand_dims(streamline=2) * [[[1.0]], [[0.5]]]})
+    # sqrt(10) mm is half way from 1 to 10 mm in the log, 10**1.25 a quarter from 10 to 100
+    for sieve, percent in {1e-3: 20, 10**-2.5: 40, 1e-2: 60, 10**-1.75: 70, 1e-1: 100}.items():
+        found = report.percent_passing(result, sieve)
+        assert found.values == pytest.approx([percent, np.nan], rel=1e-12, nan_ok=True)
+    found = report.percent_passing(result, 1e-2, total=False)
     assert found.dims == ("streamline", "gap")
     assert found.values[:, 0] == pytest.approx([60, 30], rel=1e-12)
     assert found.attrs == {"units": "percent", "long_name": "product below 10 mm"}
 
 
-def test_percent_passing_of_lost_cases():
-    found = report.percent_passing(sieved([np.nan] * 3, [0.2, 0.6, 1.0]), 2e-3)
-    assert np.isnan(found.values[0])
-    assert found.values[1] == pytest.approx(20 + 40 * math.log10(2), rel=1e-12)
-
-
 def test_spread_is_the_sample_standard_deviation():
     # mean 7/3, squares 16/9 + 1/9 + 25/9 = 42/9, over n - 1 = 2
     assert report.spread(replicates(1.0, 2.0, 4.0)).item() == pytest.approx(math.sqrt(7 / 3), rel=1e-15)
-
-
-def test_spread_of_equal_replicates_is_zero():
-    values = replicates(0.1, 0.1, 0.1)
-    assert values.std("replicate", ddof=1) > 0  # rounding of the mean, which must not be shown
-    assert report.spread(values).item() == 0
-
-
-def test_spread_of_one_replicate_is_unknown():
+    assert report.spread(replicates(1.0, np.nan, 3.0)).item() == pytest.approx(math.sqrt(2), rel=1e-15)
+    equal = replicates(0.1, 0.1, 0.1)
+    assert equal.std("replicate", ddof=1) > 0  # rounding of the mean, which must not be shown
+    assert report.spread(equal).item() == 0
     assert np.isnan(report.spread(replicates(1.0)))
     assert np.isnan(report.spread(replicates(1.0, np.nan)))
-    assert np.isnan(report.spread(replicates(np.nan, np.nan)))
-    assert report.spread(replicates(1.0, np.nan, 3.0)).item() == pytest.approx(math.sqrt(2), rel=1e-15)
 
 
-def test_figures_are_in_the_units_people_use(result):
-    found = report.figures(result, 1e-3)
-    scale = {"throughput [t/h]": ("throughput", 3.6), "P50 [mm]": ("p50_total", 1e3), "P80 [mm]": ("p80_total", 1e3)}
-    scale["peak pressure [MPa]"] = ("peak_pressure", 1e-6)
-    assert set(found) == {*scale, "below 1 mm [%]"}
-    for heading, (name, factor) in scale.items():
-        assert found[heading].values == pytest.approx(result[name].values.astype(float) * factor, rel=1e-14)
-    k = int(np.flatnonzero(np.isclose(result["sieve"], 1e-3))[0])
-    exact = 100 * result["passing_total"].isel(sieve=k).astype(float)
-    assert found["below 1 mm [%]"].values == pytest.approx(exact.values, rel=1e-12)
-
-
-def test_axes_keep_their_order(result):
+def test_table_holds_every_operating_point_in_the_units_people_use(result):
     assert report.axes_of(result) == ["roll_speed", "gap"]
-
-
-def test_table_holds_every_operating_point_in_order(result):
     product, machine = report.table(result, 1e-3).split("\n\n")
     *machine, last = machine.splitlines()
     assert last == "(mean ± standard deviation of 3 replicates)"
+    units = {
+        "throughput [t/h]": ("throughput", 3.6),
+        "P50 [mm]": ("p50_total", 1e3),
+        "P80 [mm]": ("p80_total", 1e3),
+        "peak pressure [MPa]": ("peak_pressure", 1e-6),
+        "Fsp [N/mm²]": ("specific_pressing_force", 1e-6),
+        "force [kN]": ("pressing_force", 1e-3),
+        "torque [kN m]": ("torque", 1e-3),
+        "power [kW]": ("power", 1e-3),
+        "W [kWh/t]": ("specific_energy", 1 / 3600),
+        "mdot [t s/(h m³)]": ("specific_throughput", 3.6),
+        "nip [deg]": ("nip_angle", 180 / np.pi),
+        "beta [deg]": ("force_angle", 180 / np.pi),
+    }
+    below = 100 * result["passing_total"].sel(sieve=1e-3).astype(float)
+    seen = set()
     for lines in (product.splitlines(), machine):
-        assert len({len(line) for line in lines}) == 1  # columns are aligned
-        assert lines[0].split("  ")[0] == "roll speed [rpm]"
-        rows = [line.split()[:2] for line in lines[1:]]
-        assert rows == [["10", "60"], ["10", "40"], ["20", "60"], ["20", "40"], ["30", "60"], ["30", "40"]]
-        assert all("±" in line for line in lines[1:])
-
-
-def test_table_has_force_power_and_energy_in_the_units_people_use(result):
-    one = result.isel(roll_speed=[0], gap=[0], replicate=[0])
-    heading, row = report.table(one, 1e-3).split("\n\n")[1].splitlines()
-    shown = dict(zip(re.split(r"\s{2,}", heading.strip()), row.split(), strict=True))
-    for name, (column, factor) in {
-        "specific_pressing_force": ("Fsp [N/mm²]", 1e-6), "pressing_force": ("force [kN]", 1e-3),
-        "torque": ("torque [kN m]", 1e-3), "power": ("power [kW]", 1e-3), "specific_energy": ("W [kWh/t]", 1 / 3600),
-        "specific_throughput": ("mdot [t s/(h m³)]", 3.6), "nip_angle": ("nip [deg]", 180 / np.pi),
-        "force_angle": ("beta [deg]", 180 / np.pi),
-    }.items():  # fmt: skip
-        assert float(shown[column]) == pytest.approx(float(one[name].item()) * factor, rel=1e-3), name
-
-
-def test_table_of_one_replicate_has_no_spread(result):
+        headings, *rows = (re.split(r"\s{2,}", line.strip()) for line in lines)
+        assert [row[:2] for row in rows] == [[speed, gap] for speed in ("10", "20", "30") for gap in ("60", "40")]
+        for k, heading in enumerate(headings[2:], start=2):
+            name, factor = units.get(heading, (None, None))
+            values = below if name is None else result[name].astype(float) * factor
+            mean, deviation = rows[1][k].split(" ± ")
+            one = values.isel(roll_speed=0, gap=1)
+            assert float(mean) == pytest.approx(float(one.mean()), rel=1e-3), heading
+            assert float(deviation) == pytest.approx(float(one.std(ddof=1)), rel=0.1, abs=1e-6 * float(one.mean())), (
+                heading
+            )
+        seen |= set(headings)
+    assert seen == {"roll speed [rpm]", "gap [mm]", "below 1 mm [%]", *units}
     assert "±" not in report.table(result.isel(replicate=[0]), 1e-3)
 
 
@@ -138,18 +120,14 @@ def test_table_with_lost_cases(result):
     assert lines[3].split()[4] == f"{alone:.4g}"
     assert "±" not in lines[3]  # one replicate is left, and has no spread
     assert "±" in lines[2]
-
-
-def test_table_without_results(result):
     lose(result, "boom")
     assert report.table(result, 1e-3) == "no case holds a result"
-    assert not report.any_result(result)
 
 
-def test_table_without_axes(swept):
+def test_table_without_axes_and_cells():
     base = paper({"resolution.streamlines": 2, "resolution.points": 20, "resolution.cells": 0})
     product, machine = (part.splitlines() for part in report.table(sweep(base, {}), 1e-3).split("\n\n"))
-    assert product[0].split("  ") == ["throughput [t/h]", "peak pressure [MPa]"]
+    assert product[0] == "throughput [t/h]  peak pressure [MPa]"
     assert machine[0].startswith("Fsp [N/mm²]")
     assert len(product) == len(machine) == 2
 
@@ -166,31 +144,32 @@ def test_lost_cases_are_grouped_by_place_and_reason(result):
     ]
 
 
-def test_lost_cases_of_a_text_axis():
-    base = paper({"resolution.streamlines": 2, "resolution.points": 20, "resolution.cells": 0})
-    result = sweep(base, {"stress.integrator": ["euler"], "rolls.gap": ["1.2 m"]})
-    [line] = report.lost_cases(result)
-    assert line.startswith("refused: stress integrator euler, gap 1200 mm, 1 of 1 replicates: rolls.gap: got 1200 mm")
-
-
-def test_notes(result):
+def test_remarks_tell_limits_and_the_scene_s_own(result):
     result["flags"][:] = 0
-    result["notes"][:] = "no_breakage: whole\nfew_cells: too few"
-    assert report.notes(result) == []
-    result["flags"][{"roll_speed": 0, "gap": 1, "replicate": 2}] = FLAGS["no_breakage"] | FLAGS["few_cells"]
-    result["flags"][{"roll_speed": 2}] = FLAGS["few_cells"]
-    assert report.notes(result) == [
+    result["diagnostics"][:] = "no_breakage: whole\nfew_cells: too few"
+    assert report.remarks(result) == []
+    result["flags"][{"roll_speed": 0, "gap": 1, "replicate": 2}] = BITS["no_breakage"] | BITS["few_cells"]
+    result["flags"][{"roll_speed": 2}] = BITS["few_cells"]
+    result.attrs["scene"] = result.attrs["scene"].replace('"remark":""', '"remark":"not calibrated"')
+    assert report.remarks(result) == [
+        "remark: not calibrated",
         "flag no_breakage at 1 of 6 operating points; the first: whole",
         "flag few_cells at 3 of 6 operating points; the first: too few",
     ]
-    result.attrs["scene"] = result.attrs["scene"].replace('"note":""', '"note":"not calibrated"')
-    assert report.notes(result)[0] == "note: not calibrated"
 
 
-def test_labels(result):
-    assert report.axis_label(result["roll_speed"]) == "roll speed [rpm]"
-    assert report.axis_label(result["gap"]) == "gap [mm]"
-    assert report.shown_values(result["roll_speed"]) == pytest.approx([10, 20, 30], rel=1e-12)
-    plain = xr.DataArray(["a"], dims="stress_integrator", name="stress_integrator", attrs={"units": "1"})
-    assert report.axis_label(plain) == "stress integrator"
-    assert report.shown_values(plain).tolist() == ["a"]
+def test_change_is_that_of_pairs(result):
+    """Half the sizes at 40 mm, to within a spread that replicates do not share: -50 % from wide to narrow."""
+    noise = xr.DataArray([0.99, 1.0, 1.01], dims="replicate")
+    result["p80_total"] = xr.ones_like(result["p80_total"]) * 0.001 * noise
+    result["p80_total"][{"gap": 0}] *= 2
+    assert report.change(result, "rolls.gap") == [
+        "P80 changes by +100 ± 0 % from gap 40 mm to gap 60 mm (mean ± standard error of pairs)."
+    ]
+
+
+def test_axes_of_text():
+    axis = xr.DataArray(["a"], dims="integrator", name="elasticity_integrator", attrs={"units": "1"})
+    assert report.axis_label(axis) == "elasticity integrator"
+    assert report.shown_values(axis).tolist() == ["a"]
+    assert report.value_text(axis, "a") == "a"

@@ -171,7 +171,7 @@ def draw(base: Scene, generator: np.random.Generator, exchange: bool, most_secon
     for section in ("rolls", "bed", "flow", "elasticity", "strength", "fragments"):
         drawn |= _draw_section(section, chance, generator)
     for section, wanted in (("exchange", exchange), ("roll_width", width)):
-        drawn |= _draw_section(section, chance, generator) if wanted else {section: None}
+        drawn |= _draw_section(section, chance, generator) or {section: {}} if wanted else {section: None}
     drawn |= _draw_gaps(drawn.get("rolls.diameter", base.rolls.diameter), generator)
     names = ("bed.feed_solid_fraction", "bed.max_solid_fraction")  # the feed's is at most the largest
     fractions = [drawn.get(name, getattr(base.bed, name.partition(".")[2])) for name in names]
@@ -194,7 +194,7 @@ def _draw_section(section: str, chance: float, generator: np.random.Generator) -
             drawn[name] = known.draw(generator)
         elif words and not name.endswith(".kind"):
             drawn[name] = words[generator.integers(len(words))]
-    return drawn or {section: {}}
+    return drawn
 
 
 def _draw_nip(diameter: float, drawn: Mapping[str, Any], generator: np.random.Generator) -> dict[str, Any]:

@@ -46,7 +46,7 @@ def every(result: xr.Dataset) -> list[Table]:
 def in_words(found: list[Table], markdown: bool) -> str:
     """Return tables as text, or as markdown."""
     title = "**{}**\n" if markdown else "{}"
-    return "\n\n".join(f"{title.format(each.title)}\n{aligned(each.headings, each.rows, markdown)}" for each in found)
+    return "\n\n".join(f"{title.format(each.title)}\n{aligned(each.headings, each.rows, markdown, words=1)}" for each in found)
 
 
 def _percent(value: float) -> str:
