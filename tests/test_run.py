@@ -2,6 +2,7 @@ import doctest
 import importlib
 import math
 import pkgutil
+import re
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -255,6 +256,30 @@ def test_exit_solid_fraction_above_its_limit_is_flagged_with_the_figure():
     assert float(ds["continuity_solid_fraction"].max()) == pytest.approx(1.68, abs=0.01)
     loose = simulate(paper({"resolution.cells": 0, "bed.feed_solid_fraction": 0.3}))
     assert "solid_fraction_capped" not in flags(loose)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        (
+            {"rolls.speed": 20},
+            "surface speed 22 .* rolls.speed 20 is read in rad s-1, 191 rpm; for 20 rpm write '20 rpm'",
+        ),
+        ({"bed.solid_density": 2.74}, r"solid density 2.74 .* for 2.74 g/cm\^3 write '2.74 g/cm\^3'"),
+        ({"elasticity.bulk_modulus": 675}, "bulk modulus 0.000675 MPa .* for 675 MPa write '675 MPa'"),
+        ({"elasticity.shear_modulus": 312}, "shear modulus .* for 312 MPa write '312 MPa'"),
+        (
+            {"rolls.diameter": 800, "rolls.gap": 24, "rolls.entry_gap": 60},
+            "roll diameter 8e\\+05 mm .* for 800 mm write '800 mm'",
+        ),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_a_number_in_another_unit_is_flagged_before_all_else_with_the_unit_meant(values, words):
+    usual = presets.industrial().with_values({"resolution.cells": 0})
+    assert not flags(simulate(usual))
+    said = simulate(usual.with_values(values)).attrs["diagnostics"]
+    assert re.match(f"unusual_machine: .*{words}", said)
 
 
 def test_top_size_far_above_the_gap_is_flagged():

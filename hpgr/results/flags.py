@@ -1,5 +1,6 @@
 """Limits that a run may hit: one table of their names, bits, conditions and words."""
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -11,14 +12,26 @@ from hpgr.fields import show
 from hpgr.grains.solve import Crushed
 from hpgr.scene import Scene
 
-# Usual machines and operation (design figures of makers, as collected in the mission of this package; phi ours)
+# Usual machines, ores and operation (design figures of makers, as collected in the mission of this package; ore ours)
 USUAL = {
     "roll diameter": (0.5, 2.8, "m"),
+    "surface speed": (0.2, 3.0, "m s-1"),
+    "solid density": (1500.0, 6000.0, "kg m-3"),
+    "bulk modulus": (1e6, 1e10, "Pa"),
+    "shear modulus": (1e6, 1e10, "Pa"),
     "specific pressing force": (1e6, 9e6, "Pa"),
     "specific energy": (3600.0, 10800.0, "J kg-1"),
     "gap over diameter": (0.02, 0.03, "1"),
     "exit solid fraction": (0.75, 0.92, "1"),
 }
+_INPUTS = {  # by field: its unit, the one a plant may have meant, and how many of that make the SI unit
+    "roll diameter": ("rolls.diameter", "m", "mm", 1e3),
+    "surface speed": ("rolls.speed", "rad s-1", "rpm", 60 / (2 * math.pi)),
+    "solid density": ("bed.solid_density", "kg m-3", "g/cm^3", 1e-3),
+    "bulk modulus": ("elasticity.bulk_modulus", "Pa", "MPa", 1e-6),
+    "shear modulus": ("elasticity.shear_modulus", "Pa", "MPa", 1e-6),
+}
+_FAR = 3.0  # times beyond its range from which a number is suspected of having been given in another unit
 _NIPPING = 1.5  # top size over gap above which rolls nip single grains, which is not modelled
 
 
@@ -75,16 +88,35 @@ def _unusual_machine(run: Run) -> str:
     rolls = run.scene.rolls
     values = {
         "roll diameter": rolls.diameter,
+        "surface speed": rolls.surface_speed,
+        "solid density": run.scene.bed.solid_density,
+        "bulk modulus": run.scene.elasticity.bulk_modulus,
+        "shear modulus": run.scene.elasticity.shear_modulus,
         "specific pressing force": run.performance.specific_pressing_force,
         "specific energy": run.performance.specific_energy,
         "gap over diameter": rolls.gap / rolls.diameter,
         "exit solid fraction": float(run.bed.stress.solid_fraction[:, -1].mean()),
     }
     return "; ".join(
-        f"{name} {show(values[name], unit, 4)} (usual {show(low, unit)} to {show(high, unit)})"
+        f"{name} {show(values[name], unit, 4)} (usual {show(low, unit)} to {show(high, unit)}"
+        f"{_meant_otherwise(run.scene, name, values[name])})"
         for name, (low, high, unit) in USUAL.items()
         if not low <= values[name] <= high
     )
+
+
+def _meant_otherwise(scene: Scene, name: str, value: float) -> str:
+    """Return in words the unit that was probably meant, or nothing: a value far off that another unit makes usual."""
+    low, high, _ = USUAL[name]
+    if name not in _INPUTS or low / _FAR <= value <= high * _FAR:
+        return ""
+    field, unit, plant, factor = _INPUTS[name]
+    section, _, key = field.partition(".")
+    given = getattr(getattr(scene, section), key)
+    if not low / _FAR <= value / factor <= high * _FAR:
+        return ""
+    shown = show(given, unit, 4)
+    return f"; {field} {given:g} is read in {unit}, {shown}; for {given:g} {plant} write '{given:g} {plant}'"
 
 
 def _no_compaction(run: Run) -> str:
@@ -148,12 +180,12 @@ def _few_cells(run: Run) -> str:
 
 
 FLAGS = (  # in the order in which they are told
+    Flag("unusual_machine", 128, "machine, ore or operation outside usual ranges", _unusual_machine),
     Flag("no_compaction", 2, "nothing is compacted: the product is the feed", _no_compaction),
     Flag("solid_fraction_capped", 4, "mass continuity would need a denser cake", _solid_fraction_capped),
     Flag("single_particle_nipping", 8, f"the feed's top size is above {_NIPPING:g} gaps", _single_particle_nipping),
     Flag("tension_clamped", 64, "the elastic law asked for tension or reverse shear", _tension_clamped),
     Flag("no_limit_of_steps", 512, "stresses need not converge as time steps shrink", _no_limit_of_steps),
-    Flag("unusual_machine", 128, "machine or operation outside usual ranges", _unusual_machine),
     Flag("no_force_angle", 256, "more power than the force can give at any angle", _no_force_angle),
     Flag("no_breakage", 1, "no grain broke: the product is the feed", _no_breakage),
     Flag("size_floor_reached", 16, "part of the product is below the size floor", _size_floor_reached),
