@@ -22,7 +22,7 @@ class Unit(NamedTuple):
 
     shown: str
     factor: float  # how many of the shown unit make one SI unit
-    pint: str  # as the parser of units spells it; empty for what is never read
+    pint: str  # as the parser of units spells it
     example: str
 
 
@@ -33,10 +33,10 @@ UNITS = {
     "rad": Unit("deg", 180 / math.pi, "rad", "9 deg"),
     "kg m-3": Unit("kg m-3", 1.0, "kg/m^3", "2.7 g/cm^3"),
     "N m": Unit("kN m", 1e-3, "N*m", "2 kN*m"),
-    "kg s-1": Unit("t/h", 3.6, "", ""),
-    "N": Unit("kN", 1e-3, "", ""),
-    "W": Unit("kW", 1e-3, "", ""),
-    "J kg-1": Unit("kWh/t", 1 / 3600, "", ""),
+    "kg s-1": Unit("t/h", 3.6, "kg/s", "200 t/h"),
+    "N": Unit("kN", 1e-3, "N", "900 kN"),
+    "W": Unit("kW", 1e-3, "W", "300 kW"),
+    "J kg-1": Unit("kWh/t", 1 / 3600, "J/kg", "1.5 kWh/t"),
 }
 
 # stricter than pint, which reads past what it does not understand ("60; mm") and sums up ("60 mm + 1 m")

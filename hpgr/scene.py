@@ -102,7 +102,14 @@ class Rolls(Frozen):
 
 
 class Bed(Frozen):
-    """Density of the grains, and how densely the bed packs."""
+    """Density of the grains, and how densely the bed packs.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> hpgr.Bed(solid_density=2740.0).max_solid_fraction
+    0.9
+    """
 
     solid_density: Density = quantity(
         2650.0, symbol="rho_s", unit="kg m-3", source="quartz, 2650 kg/m3", example=2700, ge=1, le=1e5
@@ -279,7 +286,7 @@ class Scene(Frozen):
         >>> import hpgr
         >>> with TemporaryDirectory() as folder:
         ...     path = Path(folder) / "mine.toml"
-        ...     _ = path.write_text('base = "paper"\n[rolls]\ngap = "50 mm"\n')
+        ...     _ = path.write_text('base = "paper"\\n[rolls]\\ngap = "50 mm"\\n')
         ...     hpgr.Scene.from_file(path).rolls.gap
         0.05
         """

@@ -97,9 +97,7 @@ def test_values_are_shown_in_the_unit_people_use():
 
 
 def test_examples_of_units_are_read():
-    for unit, entry in UNITS.items():
-        if entry.example:
-            assert parse(entry.example, unit) > 0
+    assert all(parse(entry.example, unit) > 0 for unit, entry in UNITS.items())
 
 
 @pytest.mark.parametrize("value", [-1, 1.0, 1.5, True, 2**63, "0", None])
