@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from support import paper
 
-from hpgr import Scene, flow, geometry, metrics, pipeline, presets, simulate
+from hpgr import Scene, presets, simulate
+from hpgr.bed.loaded import inputs_of, load_bed
+from hpgr.results import metrics
 from studies.sweep import sweep
 
 SMALL = {"resolution.points": 101, "resolution.streamlines": 5, "resolution.cells": 60, "resolution.record": "product"}
-CLOSED = {"material.cushioning": float("inf")}  # smooth in every axis: no cell is counted
+CLOSED = {"strength.cushioning": float("inf")}  # smooth in every axis: no cell is counted
 FORCES = [2.0e6, 2.8e6, 3.6e6, 4.4e6]
 REAL = {"khd_pilot": presets.khd_pilot, "industrial": presets.industrial}
 each_real = pytest.mark.parametrize("preset", REAL.values(), ids=REAL)
@@ -31,8 +33,8 @@ def pressed(request):
 
 def throughput_of(scene):
     """Throughput in double precision."""
-    prepared = pipeline.prepare(scene)
-    return metrics.gap_throughput(scene, float(prepared.state.solid_fraction[:, -1].mean()))
+    solid_fraction = load_bed(inputs_of(scene)).stress.solid_fraction
+    return metrics.gap_throughput(scene, float(solid_fraction[:, -1].mean()))
 
 
 # --- throughput ---------------------------------------------------------------------------------------------
@@ -54,7 +56,7 @@ def test_throughput_of_the_papers_machine_is_linear_in_the_gap():
     gaps = np.array([0.03, 0.06, 0.09])
     result = sweep(paper(), {"rolls.gap": gaps}, threads=1).isel(replicate=0)
     assert result["throughput"].values == pytest.approx(2650 * 0.9 * gaps * 5.9690, rel=1e-5)
-    assert all("held at max_solid_fraction" in note for note in result["notes"].values)
+    assert all("held at max_solid_fraction" in words for words in result["diagnostics"].values)
 
 
 @each_real
@@ -67,11 +69,10 @@ def test_throughput_past_a_nip_is_what_the_nip_takes_in(preset):
     gaps = np.array([0.025, 0.027, 0.029]) * preset().rolls.diameter
     scenes = [real(preset, {"rolls.gap": gap}) for gap in gaps]
     found = np.array([throughput_of(scene) for scene in scenes])
-    rolls, ore, angle = scenes[0].rolls, scenes[0].material, flow.nip_angle(scenes[0])
-    speed = rolls.speed * rolls.diameter / 2
+    rolls, ore, angle = scenes[0].rolls, scenes[0].bed, scenes[0].flow.nip_angle
     nip = gaps + rolls.diameter * (1 - np.cos(angle))
-    exact = ore.solid_density * ore.feed_solid_fraction * np.cos(angle) * nip * rolls.width * speed
-    bed = geometry.bed(rolls, 400)
+    exact = ore.solid_density * ore.feed_solid_fraction * np.cos(angle) * nip * rolls.width * rolls.surface_speed
+    bed = load_bed(inputs_of(scenes[0])._replace(streamlines=400, points=2)).geometry
     steep = bed.slope(rolls.diameter / 2 * np.sin(angle))
     mean = np.mean(1 / np.sqrt(1 + (bed.xi * steep) ** 2)) / np.cos(angle)
     assert mean == pytest.approx(1 + angle**2 / 3, abs=2e-3)
@@ -161,7 +162,7 @@ def test_product_is_finer_in_the_middle_of_the_roll_width(preset):
 
 
 def test_softer_ore_is_crushed_finer_by_the_same_machine():
-    strengths = presets.khd_pilot().material.strength * np.array([0.5, 1.0, 2.0])
-    result = sweep(real(presets.khd_pilot), {"material.strength": strengths}, threads=1).isel(replicate=0)
+    strengths = presets.khd_pilot().strength.reference_strength * np.array([0.5, 1.0, 2.0])
+    result = sweep(real(presets.khd_pilot), {"strength.reference_strength": strengths}, threads=1).isel(replicate=0)
     assert np.all(np.diff(result["p80_total"]) > 0)
     assert np.all(result["power"] == result["power"][0])  # the model's bed does not know what breaks in it

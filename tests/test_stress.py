@@ -314,14 +314,3 @@ def test_bed_of_the_pilot_rolls_stays_off_the_shear_limit():
     assert np.all(ratio >= 2 / 3)
     assert ratio[0] == pytest.approx(2 / 3, abs=0.02)
     assert ratio.max() < PILOT.elasticity.largest_shear_ratio()
-
-
-def test_substeps_only_refine_the_stress():
-    """The points are those of a scene without; what is kept of twice the points is the same to rounding."""
-    fine = load_bed(inputs_of(paper({"elasticity.substeps": 4, "resolution.points": 51})))
-    every = load_bed(inputs_of(paper({"resolution.points": 201})))
-    assert fine.kinematics.time_step == pytest.approx(4 * every.kinematics.time_step, rel=1e-14)
-    for part, other in ((fine.kinematics, every.kinematics), (fine.stress, every.stress)):
-        for name, field in part._asdict().items():
-            if np.ndim(field) == 2:
-                assert field == pytest.approx(getattr(other, name)[:, ::4], rel=1e-9, abs=1e-12), name

@@ -6,35 +6,33 @@ import pytest
 import shapely
 from support import paper
 
-from hpgr import flow, geometry, simulate, tessellation
+from hpgr.bed import kinematics, tessellation
+from hpgr.bed.loaded import inputs_of, load_bed
 
-GAPS = [1e-6, 1e-4, 0.06, 1.0, 10.0]
-GRIDS = [(1, 2), (1, 200), (2, 3), (3, 21), (10, 40), (40, 10), (200, 2)]
+# (gap, streamlines, points): from 1 um to 10 m, from one cell across or two along to many
+BEDS = [(1e-6, 1, 2), (1e-6, 10, 40), (1e-4, 40, 10), (0.06, 1, 200), (0.06, 3, 21), (1.0, 2, 3), (10.0, 200, 2)]
+each = pytest.mark.parametrize(("gap", "streamlines", "points"), BEDS)
 
 
-def scene_of(gap=0.06, streamlines=3, points=21, entry_fraction=0.02):
+def scene_of(gap=0.06, streamlines=3, points=21):
     """A bed whose rolls stay as curved as the paper's, with grains small enough to enter."""
-    return paper(
-        {
-            "rolls.gap": gap,
-            "rolls.entry_gap": gap + 1.08,
-            "resolution.streamlines": streamlines,
-            "resolution.points": points,
-            "flow.entry_fraction": entry_fraction,
-        }
-    )
+    rolls = {"rolls.gap": gap, "rolls.entry_gap": gap + 1.08}
+    return paper(rolls | {"resolution.streamlines": streamlines, "resolution.points": points})
 
 
 def laid(scene):
-    bed = geometry.bed(scene.rolls, scene.resolution.streamlines)
-    return bed, flow.move(scene, bed, scene.resolution.points)
+    """Geometry, x and y of the points, and the heights of the entry row on mid-plane and roll."""
+    inputs = inputs_of(scene)
+    bed = load_bed(inputs)
+    edges = bed.geometry._replace(xi=np.array([0.0, 1.0]))
+    rim, _ = kinematics.move(edges, inputs.laws()[0], inputs.surface_speed, inputs.points)
+    return bed.geometry, bed.kinematics.x, bed.kinematics.y, rim.y[:, 0]
 
 
 def tiled(scene):
     """Points (streamline x point, 2) and their tessellation."""
-    bed, motion = laid(scene)
-    found = tessellation.tessellate(scene, bed, motion)
-    return np.column_stack([motion.x.ravel(), motion.y.ravel()]), found
+    bed = load_bed(inputs_of(scene, tessellated=True))
+    return np.column_stack([bed.kinematics.x.ravel(), bed.kinematics.y.ravel()]), bed.tessellation
 
 
 def clipped_bisectors(points, domain):
@@ -64,8 +62,7 @@ def clipped_bisectors(points, domain):
 # --- the tiling, from 1 um to 10 m -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("gap", GAPS)
-@pytest.mark.parametrize(("streamlines", "points"), GRIDS)
+@each
 def test_cells_tile_the_bed_and_each_holds_its_point(streamlines, points, gap):
     places, found = tiled(scene_of(gap, streamlines, points))
     assert found.volume.shape == (streamlines, points)
@@ -81,8 +78,7 @@ def test_cells_tile_the_bed_and_each_holds_its_point(streamlines, points, gap):
         assert own[k] <= np.hypot(*(middle[k] - places).T).min() * (1 + 1e-9)
 
 
-@pytest.mark.parametrize("gap", GAPS)
-@pytest.mark.parametrize(("streamlines", "points"), GRIDS)
+@each
 def test_edges_are_unique_and_point_upwards(streamlines, points, gap):
     places, found = tiled(scene_of(gap, streamlines, points))
     lower, upper = found.pairs.T
@@ -108,8 +104,9 @@ def test_edges_are_unique_and_point_upwards(streamlines, points, gap):
     assert (linked == 0).all()
 
 
-@pytest.mark.parametrize("gap", GAPS)
-@pytest.mark.parametrize(("streamlines", "points"), [(1, 2), (1, 30), (2, 3), (3, 21), (20, 3), (6, 10)])
+@pytest.mark.parametrize(
+    ("gap", "streamlines", "points"), [(1e-6, 6, 10), (1e-4, 1, 30), (0.06, 3, 21), (1.0, 2, 3), (10.0, 20, 3)]
+)
 def test_edges_are_the_bisectors_cut_by_all_others_and_the_bed(streamlines, points, gap):
     places, found = tiled(scene_of(gap, streamlines, points))
     wanted = clipped_bisectors(places, found.domain)
@@ -119,7 +116,7 @@ def test_edges_are_the_bisectors_cut_by_all_others_and_the_bed(streamlines, poin
         assert abs(lengths.get(pair, 0.0) - wanted.get(pair, 0.0)) < 1e-9 * found.domain.length
 
 
-@pytest.mark.parametrize("gap", GAPS)
+@pytest.mark.parametrize("gap", [1e-6, 0.06, 10.0])
 def test_edges_lie_halfway_between_their_points_and_close_each_inner_cell(gap):
     """Of a cell inside the bed: sum of length x outward normal = 0, and area = sum of length x distance / 4."""
     places, found = tiled(scene_of(gap, 6, 40))
@@ -139,24 +136,11 @@ def test_edges_lie_halfway_between_their_points_and_close_each_inner_cell(gap):
 # --- by hand -----------------------------------------------------------------------------------------------
 
 
-def square_lattice(scene, columns=3, rows=4):
-    """A bed of squares of side 1: height rows - 1/2, points (i + 1/2, j), the lowest row on the exit.
-
-    The bed ends at the entry row, so both end rows have half squares.
-    """
-    bed, motion = laid(scene)
-    x, y = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows - 1, -1, -1.0), indexing="ij")
-    # a straight duct: X(y) = columns
-    duct = bed._replace(half_gap=float(columns), b=0.0, c=0.0, height=float(rows))
-    return duct, motion._replace(x=x, y=y)
-
-
-def test_squares_by_hand(monkeypatch):
-    scene = scene_of(streamlines=3, points=4)
-    duct, motion = square_lattice(scene)
-    rim = motion._replace(y=np.array([[3.0], [3.0]]))
-    monkeypatch.setattr(tessellation.flow, "move", lambda *args: rim)
-    found = tessellation.tessellate(scene, duct, motion)
+def test_squares_by_hand():
+    """Squares of side 1, points (i + 1/2, j), the lowest row on the exit and the entry row on the top of a duct."""
+    x, y = np.meshgrid(np.arange(3) + 0.5, np.arange(3, -1, -1.0), indexing="ij")
+    duct = laid(scene_of())[0]._replace(half_gap=3.0, b=0.0, c=0.0, height=4.0)
+    found = tessellation.tessellate(duct, x, y, np.array([3.0, 3.0]))
     assert np.allclose(found.volume, [[0.5, 1, 1, 0.5]] * 3, rtol=1e-12)
     assert found.domain.area == pytest.approx(9, rel=1e-12)
     # points are numbered streamline by streamline from the entry, row 3, to the exit, row 0
@@ -178,15 +162,14 @@ def test_squares_by_hand(monkeypatch):
 def test_domain_is_the_bed():
     """Area between mid-plane and X(y), above the exit and below the entry row, to the outline's 512 chords."""
     scene = scene_of(0.06, 10, 40)
-    bed, motion = laid(scene)
+    bed, x, y, rim = laid(scene)
     _, found = tiled(scene)
-    rim = flow.move(scene, bed._replace(xi=np.array([0.0, 1.0])), 40).y[:, 0]
 
     def area_below(height):
         return bed.half_gap * height + bed.b * height**3 / 3 + bed.c * height**4 / 4
 
-    top = np.concatenate([[rim[0]], motion.y[:, 0], [rim[1]]])
-    across = np.concatenate([[0.0], motion.x[:, 0], [bed.outer(rim[1])]])
+    top = np.concatenate([[rim[0]], y[:, 0], [rim[1]]])
+    across = np.concatenate([[0.0], x[:, 0], [bed.outer(rim[1])]])
     above = np.sum((top[1:] + top[:-1] - 2 * rim[1]) / 2 * np.diff(across))  # the entry row dips towards the roll
     assert found.domain.area == pytest.approx(area_below(rim[1]) + above, rel=1e-5)
     low_x, low_y, high_x, high_y = found.domain.bounds
@@ -206,21 +189,17 @@ def test_volumes_do_not_depend_on_speed():
 
 
 def test_points_that_coincide_are_refused():
-    scene = scene_of()
-    bed, motion = laid(scene)
-    x, y = motion.x.copy(), motion.y.copy()
+    bed, x, y, rim = laid(scene_of())
     x[1, 7], y[1, 7] = x[0, 7], y[0, 7]
     with pytest.raises(ValueError, match=r"tessellation: .* lie too close together .* use fewer streamlines"):
-        tessellation.tessellate(scene, bed, motion._replace(x=x, y=y))
+        tessellation.tessellate(bed, x, y, rim)
 
 
 def test_points_outside_the_bed_are_refused():
-    scene = scene_of()
-    bed, motion = laid(scene)
-    x = motion.x.copy()
+    bed, x, y, rim = laid(scene_of())
     x[2, 7] += 3.0
     with pytest.raises(ValueError, match="tessellation: the cells miss the bed's area"):
-        tessellation.tessellate(scene, bed, motion._replace(x=x))
+        tessellation.tessellate(bed, x, y, rim)
 
 
 def test_lost_points_are_refused(monkeypatch):
@@ -236,10 +215,9 @@ def test_a_gap_below_double_precision_is_refused_or_tiled():
     """At some gap, neighbours on the exit row are one point to GEOS: an error, never a silent hole."""
     outcomes = set()
     for gap in 10.0 ** -np.arange(8, 21, 2):
-        scene = scene_of(0.06, 50, 5)
-        narrow = scene.rolls.model_copy(update={"gap": float(gap)})  # a scene refuses gaps below 1 um
+        narrow = inputs_of(scene_of(0.06, 50, 5), tessellated=True)._replace(gap=float(gap))  # refused by a scene
         try:
-            _, found = tiled(scene.model_copy(update={"rolls": narrow}))
+            found = load_bed(narrow).tessellation
         except ValueError as error:
             outcomes.add(str(error).split("; ")[2])
         else:
@@ -247,17 +225,3 @@ def test_a_gap_below_double_precision_is_refused_or_tiled():
             assert (found.volume > 0).all()
             outcomes.add("tiled")
     assert outcomes - {"tiled"} == {"the material points lie too close together for double precision"}
-
-
-# --- only what the scene requires --------------------------------------------------------------------------
-
-
-def test_volume_is_in_the_dataset_only_with_exchange():
-    scene = scene_of(0.06, 3, 21).with_values({"resolution.cells": 8})
-    assert "volume" not in simulate(scene)
-    mixed = scene.with_values({"exchange.mixing": 0.1})
-    found = simulate(mixed)["volume"]
-    assert found.dims == ("streamline", "point")
-    assert found.attrs["units"] == "m2"
-    assert np.array_equal(found, tiled(mixed)[1].volume.astype(np.float32))
-    assert "volume" not in simulate(mixed.with_values({"resolution.cells": 0}))

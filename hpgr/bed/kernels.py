@@ -44,7 +44,7 @@ class Table(NamedTuple):
 
 
 @_compiled
-def line_of(bed, flow, xi):
+def _line(bed, flow, xi):
     """Return a streamline; the nip is at the height R sin(alpha)."""
     nip = min(bed.radius * math.sin(flow.nip_angle), bed.height) if flow.nip_angle > 0 else bed.height
     return Line(bed.half_gap, bed.height, bed.b, bed.c, nip, xi)
@@ -79,7 +79,7 @@ def _descent(line, flow, y, depth):
 
 
 @_compiled
-def gradient(line, flow, y, depth):
+def _gradient(line, flow, y, depth):
     """Return |v| / U and the velocity gradient in U/H: v_xx, v_xy, v_yx, v_yy, where v_xy is the change of v_x by y.
 
     The velocity follows the streamline; its direction varies with x at fixed y because xi does.
@@ -94,7 +94,7 @@ def gradient(line, flow, y, depth):
 
 
 @_compiled
-def deviator(v_xx, v_xy, v_yx, v_yy):
+def _deviator(v_xx, v_xy, v_yx, v_yy):
     """Return xx, yy and xy of the strain rate's deviator in plane strain, and the shear rate sqrt(2/3 e':e')."""
     third = (v_xx + v_yy) / 3
     xx, yy, xy = v_xx - third, v_yy - third, (v_xy + v_yx) / 2
@@ -104,8 +104,8 @@ def deviator(v_xx, v_xy, v_yx, v_yy):
 @_compiled
 def _rates(line, flow, y, depth):
     """Return |v| / U, volumetric (compaction positive) and triaxial shear strain rate in U/H."""
-    speed, v_xx, v_xy, v_yx, v_yy = gradient(line, flow, y, depth)
-    _, _, _, shear = deviator(v_xx, v_xy, v_yx, v_yy)
+    speed, v_xx, v_xy, v_yx, v_yy = _gradient(line, flow, y, depth)
+    _, _, _, shear = _deviator(v_xx, v_xy, v_yx, v_yy)
     # above a nip 0 by construction: what is left is rounding
     return speed, 0.0 if flow.nip_angle > 0 and y > line.nip else -(v_xx + v_yy), shear
 
@@ -227,12 +227,12 @@ def lay(bed, flow, surface_speed, y, speed, volumetric_rate, shear_rate, volumet
     Fills heights, m, speeds, m/s, and strain rates, 1/s, of the points, and the strains of the step that ends at each.
     """
     lines, points = y.shape
-    middle = line_of(bed, flow, 0.0)
+    middle = _line(bed, flow, 0.0)
     table, places, unit_time = _cut(middle, flow), np.empty(points), bed.height / surface_speed
     duration = _tabulate(middle, flow, table)
     time_step, closest = duration * unit_time / (points - 1), math.inf
     for i in range(lines):
-        line = line_of(bed, flow, bed.xi[i])
+        line = _line(bed, flow, bed.xi[i])
         _tabulate(line, flow, table)
         _march_back(line, flow, table, duration, places)
         for j in range(points):
@@ -359,14 +359,12 @@ def load(elastic, feed_solid_fraction, max_solid_fraction, time_step, volumetric
 
 
 @_compiled
-def across(line, flow, y):
-    """Return n.(-e').n over the shear strain rate on the roll's line, n its normal: 1 in uniaxial compaction.
+def across(slope, v_xx, v_xy, v_yx, v_yy):
+    """Return n.(-e').n over the shear strain rate, n normal to a line of dx/dy = `slope`: 1 in uniaxial compaction.
 
     With stress and strain rate coaxial the normal stress there is p + 2 q / 3 times this.
     """
-    _, v_xx, v_xy, v_yx, v_yy = gradient(line, flow, y, 1 - y / line.height)
-    xx, yy, xy, shear = deviator(v_xx, v_xy, v_yx, v_yy)
-    _, slope, _ = _shape(line, y)
+    xx, yy, xy, shear = _deviator(v_xx, v_xy, v_yx, v_yy)
     normal = (xx - 2 * slope * xy + slope * slope * yy) / (1 + slope * slope)
     return -normal / shear if shear > 0 else 0.0
 
@@ -374,12 +372,14 @@ def across(line, flow, y):
 @_compiled
 def wall_force(bed, flow, y, p, q):
     """Return the integral of the normal stress over the height of the roll's streamline (point,), N/m."""
-    line = line_of(bed, flow, 1.0)
+    line = _line(bed, flow, 1.0)
     force = old_normal = old_y = 0.0
     for j in range(y.size):
         normal, height = p[j], min(y[j], line.nip)
         if q[j] > 0:
-            normal += 2 / 3 * q[j] * across(line, flow, y[j])
+            _, slope, _ = _shape(line, y[j])
+            _, v_xx, v_xy, v_yx, v_yy = _gradient(line, flow, y[j], 1 - y[j] / line.height)
+            normal += 2 / 3 * q[j] * across(slope, v_xx, v_xy, v_yx, v_yy)
         if j > 0:
             force += (old_y - height) * (normal + old_normal) / 2
         old_normal, old_y = normal, height
@@ -395,7 +395,7 @@ def power(bed, flow, y, speed, volumetric, shear, p, q):
     tubes = y.shape[0] - 1
     total = 0.0
     for i in range(tubes):
-        line, old_flux = line_of(bed, flow, bed.xi[i]), 0.0
+        line, old_flux = _line(bed, flow, bed.xi[i]), 0.0
         for j in range(y.shape[1]):
             outer, slope, _ = _shape(line, y[i, j])
             t = line.xi * slope
