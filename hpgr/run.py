@@ -114,6 +114,8 @@ def simulate(
 
     Raises
     ------
+    TypeError
+        If `scene` is none, such as the path of one.
     ValueError
         If the seed or replicate is not a whole number from 0 to 2**63 - 1, if material points coincide, if exchange
         would need absurdly many substeps, if no gap carries the scene's pressing force, or if the tolerance cannot be
@@ -129,6 +131,8 @@ def simulate(
     >>> dict(dataset["size"].sizes)
     {'time': 1, 'streamline': 10, 'point': 50, 'cell': 200}
     """
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene: got {scene!r:.80}; must be a scene; such as hpgr.Scene.from_file('my_machine.toml')")
     check_seed("seed", seed)
     check_seed("replicate", replicate)
     chosen = {}

@@ -40,6 +40,15 @@ def test_passing_counts_the_cells_that_are_no_larger(cells):
     assert np.array_equal(found.values, np.stack([np.mean(sizes <= s, axis=1) for s in sieves], axis=1))
 
 
+def test_sieves_may_be_texts_with_a_unit_and_what_is_none_is_refused(cells, product):
+    for ds in (cells, product):
+        assert passing(ds, ["1 mm", 0.002]).identical(passing(ds, [0.001, 0.002]))
+        assert passing(ds, "1 mm").identical(passing(ds, 0.001))
+        for sieves in (["6 apples"], ["6"], [0], [None], ["6 kg"], [float("nan")]):
+            with pytest.raises(ValueError, match=r"sieves: got .*; such as \['1 mm'\]"):
+                passing(ds, sieves)
+
+
 def test_whole_gap_is_the_mean_of_its_equal_tubes(cells):
     assert passing(cells, [0.001], total=True).values == pytest.approx(passing(cells, [0.001]).values.mean(axis=0))
     assert passing(cells, [0.001], total=True).dims == ("sieve",)

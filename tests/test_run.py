@@ -78,6 +78,11 @@ def test_bad_seeds_are_refused(name):
             simulate(paper({"resolution.cells": 0}), **{name: value})
 
 
+def test_the_path_of_a_scene_is_refused_with_what_reads_it():
+    with pytest.raises(TypeError, match=r"scene: got 'x\.toml'; must be a scene; such as hpgr\.Scene\.from_file"):
+        simulate("x.toml")
+
+
 # --- conservation ------------------------------------------------------------------------------------------
 
 
