@@ -1,21 +1,23 @@
+import itertools
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy import linalg, special, stats
-from support import COMPILED, SIGMAS, paper, sized, streams
+from support import COMPILED, GOLDEN, SIGMAS, paper, sized, split_mix
 
-from hpgr import exchange, flow, geometry, kernels, simulate, stress, tessellation
-from hpgr.exchange import SwapRates
+from hpgr import simulate
+from hpgr.bed.loaded import inputs_of, load_bed
+from hpgr.grains import kernels, lattice
+from hpgr.grains.kernels import Edges, Parcels
+from hpgr.grains.lattice import SwapRates, swap_rates
 
 INF = math.inf
 
 
 def prepared(scene):
-    """What the pipeline hands to swap_rates."""
-    bed = geometry.bed(scene.rolls, scene.resolution.streamlines)
-    motion = flow.move(scene, bed, scene.resolution.points)
-    return motion, stress.load(scene, motion), tessellation.tessellate(scene, bed, motion)
+    return load_bed(inputs_of(scene, tessellated=True))
 
 
 def mixed(values=None):
@@ -25,27 +27,22 @@ def mixed(values=None):
 # --- swap rates --------------------------------------------------------------------------------------------
 
 
+def bed_of(shear_rate, time_step, solid_fraction, pairs, length, normal, distance):
+    """Return as much of a loaded bed as swap rates are made of."""
+    return SimpleNamespace(
+        kinematics=SimpleNamespace(shear_rate=np.array(shear_rate), time_step=time_step),
+        stress=SimpleNamespace(solid_fraction=np.array(solid_fraction)),
+        tessellation=SimpleNamespace(pairs=np.array(pairs), length=length, normal=normal, distance=distance),
+    )
+
+
 def one_edge(segregation, mixing):
     """Two points 0.2 m apart, the edge 0.3 m long and tilted, in a stream tube of 5 mm."""
-    scene = paper(
-        {
-            "exchange.segregation": segregation,
-            "exchange.mixing": mixing,
-            "resolution.streamlines": 2,
-            "resolution.points": 2,
-            "rolls.gap": 0.02,
-            "rolls.diameter": 6.0,
-            "rolls.speed": 2.0,
-        }
-    )
-    zero = np.zeros((2, 2))
-    motion = flow.Motion(zero, zero, np.zeros(2), zero, zero, np.array([[4.0, 6.0], [0.0, 0.0]]), 0.01)
-    state = stress.load(paper({"resolution.streamlines": 2, "resolution.points": 2}), prepared(paper())[0])
-    state = state._replace(solid_fraction=np.array([[0.6, 0.8], [0.7, 0.9]]))
-    cells = tessellation.Tessellation(
-        zero, np.array([[1, 0]]), np.array([0.3]), np.array([[0.6, 0.8]]), np.array([0.2]), None, None
-    )
-    return exchange.swap_rates(scene, motion, state, cells)
+    exchange = {"segregation": segregation, "mixing": mixing}
+    scene = paper({"exchange": exchange, "resolution.streamlines": 2, "rolls.gap": 0.02, "rolls.speed": 2.0})
+    shear_rate, solid_fraction = [[4.0, 6.0], [0.0, 0.0]], [[0.6, 0.8], [0.7, 0.9]]
+    edge = [[1, 0]], np.array([0.3]), np.array([[0.6, 0.8]]), np.array([0.2])
+    return swap_rates(scene, bed_of(shear_rate, 0.01, solid_fraction, *edge))
 
 
 def test_rates_of_one_edge_by_hand():
@@ -75,7 +72,7 @@ def test_rates_are_proportional_to_their_coefficient_and_know_no_other():
 def test_rates_are_never_negative():
     for gap in (1e-6, 0.06, 1.0):
         scene = mixed({"rolls.gap": gap, "rolls.entry_gap": gap + 1.08})
-        found = exchange.swap_rates(scene, *prepared(scene))
+        found = swap_rates(scene, prepared(scene))
         for rate in (found.rise, found.mixing):
             assert np.isfinite(rate).all()
             assert (rate >= 0).all()
@@ -94,12 +91,12 @@ def test_probabilities_per_time_step_do_not_know_the_speed():
     for factor in (2.0, 0.25, 1024.0):  # powers of two scale floats exactly
         slow = mixed()
         fast = slow.with_values({"rolls.speed": factor * slow.rolls.speed})
-        one, other = exchange.swap_rates(slow, *prepared(slow)), exchange.swap_rates(fast, *prepared(fast))
-        assert prepared(fast)[0].time_step == prepared(slow)[0].time_step / factor
+        one, other = swap_rates(slow, prepared(slow)), swap_rates(fast, prepared(fast))
+        assert prepared(fast).kinematics.time_step == prepared(slow).kinematics.time_step / factor
         for name in SwapRates._fields:
             assert np.array_equal(getattr(one, name), getattr(other, name))
     other = slow.with_values({"rolls.speed": 3.7 * slow.rolls.speed})
-    assert exchange.swap_rates(other, *prepared(other)).rise == pytest.approx(one.rise, rel=1e-12)
+    assert swap_rates(other, prepared(other)).rise == pytest.approx(one.rise, rel=1e-12)
 
 
 @pytest.mark.parametrize("record", ["cells", "distributions"])
@@ -109,18 +106,18 @@ def test_product_with_exchange_does_not_know_the_speed(record):
     one, other = simulate(slow, seed=1), simulate(fast, seed=1)
     assert float(one["swaps_per_cell"]) > 0.5
     product = "size" if record == "cells" else "mass_fraction"
-    for name in (product, "passing", "p50", "p80", "breaks_per_cell", "swaps_per_cell", "exchange_passes", "volume"):
+    for name in (product, "passing", "p50", "p80", "breaks_per_cell", "swaps_per_cell", "exchange_substeps", "volume"):
         assert np.array_equal(one[name], other[name]), name
     assert float(other["throughput"]) == pytest.approx(2 * float(one["throughput"]))
     assert float(other["elapsed_time"][0]) == pytest.approx(float(one["elapsed_time"][0]) / 2)
 
 
-# --- passes ------------------------------------------------------------------------------------------------
+# --- substeps ------------------------------------------------------------------------------------------------
 
 
-def takes_part(number, passes, most):
+def takes_part(number, substeps, most):
     """The condition of kernels.swap."""
-    return (number + 1) * passes // most != number * passes // most
+    return (number + 1) * substeps // most != number * substeps // most
 
 
 def random_rates(seed, points=12, edges=40, scale=1.0):
@@ -131,51 +128,51 @@ def random_rates(seed, points=12, edges=40, scale=1.0):
 
 
 @pytest.mark.parametrize("scale", [1e-3, 0.3, 3.0, 100.0])
-def test_probabilities_of_a_cell_sum_to_at_most_half_in_every_pass(scale):
+def test_probabilities_of_a_cell_sum_to_at_most_half_in_every_substep(scale):
     """The worst cells that could be there: every edge at its largest probability."""
     busiest = 0.0
     for seed in range(5):
         rates, means = random_rates(seed, scale=scale)
         largest = 0.06
-        passes = exchange.passes_needed(rates, rates.mixing, means, largest)
+        substeps = lattice.substeps_needed(rates, rates.mixing, means, largest)
         lower, upper = rates.pairs.T
         worst = rates.mixing + rates.rise * (largest - means[lower] + means[upper])
-        most = passes.max()
+        most = substeps.max()
         times, spread = np.zeros(lower.size, int), np.zeros(lower.size)
         for number in range(most):
-            part = takes_part(number, passes, most)
+            part = takes_part(number, substeps, most)
             times += part
-            chance = np.where(part, worst / passes, 0)
+            chance = np.where(part, worst / substeps, 0)
             spread += chance
             sums = np.bincount(lower, chance, means.size) + np.bincount(upper, chance, means.size)
             busiest = max(busiest, sums.max())
             assert sums.max() <= 0.5 + 1e-12
-        assert np.array_equal(times, passes)  # every edge takes part as often as its probability was split
+        assert np.array_equal(times, substeps)  # every edge takes part as often as its probability was split
         assert np.allclose(spread, worst, rtol=1e-12)  # and no probability is lost or clipped
     if scale >= 3:
-        assert busiest > 0.4  # no more passes than needed
+        assert busiest > 0.4  # no more substeps than needed
     assert (scale > 1e-3) or most == 1
 
 
 def test_passes_by_hand():
-    """Three points in a row, sums 0.3, 1.2 and 0.9: 1, 3 and 2 passes, an edge as many as its needier point."""
+    """Three points in a row, sums 0.3, 1.2 and 0.9: 1, 3 and 2 substeps, an edge as many as its needier point."""
     rates = SwapRates(np.array([[0, 1], [1, 2]]), np.zeros(2), np.array([0.3, 0.9]))
-    assert exchange.passes_needed(rates, rates.mixing, np.full(3, 0.02), 0.06).tolist() == [3, 3]
+    assert lattice.substeps_needed(rates, rates.mixing, np.full(3, 0.02), 0.06).tolist() == [3, 3]
     rates = SwapRates(np.array([[0, 1], [2, 3]]), np.zeros(2), np.array([0.5, 0.51]))
-    assert exchange.passes_needed(rates, rates.mixing, np.full(4, 0.02), 0.06).tolist() == [1, 2]
+    assert lattice.substeps_needed(rates, rates.mixing, np.full(4, 0.02), 0.06).tolist() == [1, 2]
 
 
 def test_segregation_counts_with_the_largest_grain_below_and_dust_above():
     rates = SwapRates(np.array([[0, 1]]), np.array([10.0]), np.zeros(1))
     means = np.array([0.01, 0.03])
-    assert exchange.passes_needed(rates, np.zeros(1), means, 0.06).tolist() == [2]  # 10 (0.05 + 0.03) = 0.8
-    assert exchange.passes_needed(rates, np.zeros(1), means, 0.02).tolist() == [1]  # 10 (0.01 + 0.03) = 0.4
-    assert exchange.passes_needed(rates, np.zeros(1), means, 0.001).tolist() == [1]  # none below the mean: 0.3
+    assert lattice.substeps_needed(rates, np.zeros(1), means, 0.06).tolist() == [2]  # 10 (0.05 + 0.03) = 0.8
+    assert lattice.substeps_needed(rates, np.zeros(1), means, 0.02).tolist() == [1]  # 10 (0.01 + 0.03) = 0.4
+    assert lattice.substeps_needed(rates, np.zeros(1), means, 0.001).tolist() == [1]  # none below the mean: 0.3
 
 
 def test_absurd_exchange_is_refused_with_its_cost():
     scene = mixed({"resolution.streamlines": 40, "resolution.points": 200, "resolution.cells": 2})
-    with pytest.raises(ValueError, match=r"exchange: .*mixing 100; they need .* passes per time step") as refused:
+    with pytest.raises(ValueError, match=r"exchange: .*mixing 100; they need .* substeps per time step") as refused:
         simulate(scene.with_values({"exchange.mixing": 100}))
     for part in ("must be at most 1,000", "predicted cost above", " s; use fewer points"):
         assert part in str(refused.value)
@@ -185,54 +182,60 @@ def test_absurd_segregation_is_refused_too(monkeypatch):
     scene = mixed(
         {"resolution.points": sized(16, 6), "resolution.cells": 2, "exchange.segregation": 100, "exchange.mixing": 0}
     )
-    needed = int(simulate(scene)["exchange_passes"])
+    needed = int(simulate(scene)["exchange_substeps"])
     assert needed > 20
-    monkeypatch.setattr(exchange, "MOST_PASSES", needed // 2)
+    monkeypatch.setattr(lattice, "MOST_SUBSTEPS", needed // 2)
     with pytest.raises(
-        ValueError, match=rf"exchange: got segregation 100 .* passes .* at most {needed // 2:,}; predicted"
+        ValueError, match=rf"exchange: got segregation 100 .* substeps .* at most {needed // 2:,}; predicted"
     ):
         simulate(scene)
 
 
 def test_the_last_number_of_passes_that_is_not_refused():
     rates = SwapRates(np.array([[0, 1]]), np.zeros(1), np.ones(1))
-    exchange.refuse_passes(mixed(), rates, exchange.MOST_PASSES)
-    with pytest.raises(ValueError, match=f"{exchange.MOST_PASSES + 1:,} passes"):
-        exchange.refuse_passes(mixed(), rates, exchange.MOST_PASSES + 1)
+    lattice.refuse_substeps(mixed(), rates, lattice.MOST_SUBSTEPS)
+    with pytest.raises(ValueError, match=f"{lattice.MOST_SUBSTEPS + 1:,} substeps"):
+        lattice.refuse_substeps(mixed(), rates, lattice.MOST_SUBSTEPS + 1)
 
 
 # --- swaps: a column of parcels ----------------------------------------------------------------------------
 
 
 class Column:
-    """Parcels with edges between them, one pass after the other under held probabilities."""
+    """Parcels with edges between them, one substep after the other under held probabilities."""
 
     def __init__(self, sizes, pairs=None, rise=0.0, mixing=0.0, means=None, seed=0):
-        self.sizes = np.array(sizes, np.float32)
-        points, cells = self.sizes.shape
-        blocks = -(-cells // kernels.BLOCK)
-        self.streams = np.arange(points * cells, dtype=np.uint64).reshape(points, cells)
-        self.reach, self.block_reach = (np.full((points, n), -1, np.float32) for n in (blocks * kernels.BLOCK, blocks))
-        self.stale, self.slots = np.ones(points, bool), np.arange(points)
+        sizes = np.array(sizes, np.float32)
+        points, cells = sizes.shape
+        states = np.arange(points * cells, dtype=np.uint64).reshape(points, cells)
+        nothing = np.empty((points, 0), np.float32)
+        self.parcels = Parcels(*(np.pad(part, ((0, 0), (1, 1))) for part in (sizes, states)), nothing, nothing)
+        self.slots = np.arange(points)
         if pairs is None:
             pairs = np.column_stack([np.arange(points - 1), np.arange(1, points)])
         self.pairs = np.array(pairs)
         self.rise, self.mixing = (np.broadcast_to(rate, len(pairs)).astype(float) for rate in (rise, mixing))
-        self.means = self.sizes.mean(axis=1, dtype=float) if means is None else np.broadcast_to(means, points).copy()
-        self.keys = iter(streams(100_000 if COMPILED else 5000, seed))
+        self.means = sizes.mean(axis=1, dtype=float) if means is None else np.broadcast_to(means, points).copy()
+        self.keys = (np.uint64(split_mix((seed << 32) + number * GOLDEN)) for number in itertools.count())
 
-    def swap(self, times=1):
-        """Return the number of swaps of `times` passes."""
-        passes = np.ones(len(self.pairs), np.int64)
-        swaps = 0
+    @property
+    def sizes(self):
+        return self.parcels.sizes[:, 1:-1]
+
+    @property
+    def streams(self):
+        return self.parcels.streams[:, 1:-1]
+
+    def swap(self, times=1, substeps=1, most=1, number=0):
+        """Return the number of swaps of `times` substeps."""
+        swaps, outdated = 0, np.zeros(self.slots.size, bool)
+        edges = Edges(self.pairs, self.rise, self.mixing, np.full(len(self.pairs), substeps))
         for _ in range(times):
-            largest = self.sizes.max(axis=1)
-            swaps += kernels.swap(
-                self.sizes, self.streams, self.reach, self.block_reach, self.stale, largest, self.slots,
-                np.zeros(self.slots.size, bool), self.pairs, self.rise, self.mixing, passes, 1, self.means, 0,
-                next(self.keys), 1 / 0.06, 1e-6,
-            )  # fmt: skip
+            largest, before = self.sizes.max(axis=1), self.sizes.copy()
+            key = next(self.keys)
+            swaps += kernels.swap(self.parcels, outdated, largest, self.slots, edges, self.means, number, most, key)
             assert (largest >= self.sizes.max(axis=1)).all()
+            assert outdated[np.any(before != self.sizes, axis=1)].all()
         return swaps
 
 
@@ -316,15 +319,15 @@ def test_neighbouring_cells_swap_independently(chance):
 
 @pytest.mark.parametrize("chance", [SPARSE, DENSEST])
 def test_each_cell_swaps_as_often_as_any_other(chance):
-    """Counts of swaps per place are binomial over the passes: also the first and the last cell. 1e-6 a test."""
-    cells, passes = 20, sized(20_000, 1_000)
+    """Counts of swaps per place are binomial over the substeps: also the first and the last cell. 1e-6 a test."""
+    cells, substeps = 20, sized(20_000, 1_000)
     column = Column(np.arange(2.0 * cells).reshape(2, cells) + 1, mixing=chance, means=1.0, seed=3)
     moved = np.zeros(cells)
-    for _ in range(passes):
+    for _ in range(substeps):
         before = column.sizes[0].copy()
         column.swap()
         moved += before != column.sizes[0]
-    statistic = np.sum((moved - passes * chance) ** 2 / (passes * chance * (1 - chance)))
+    statistic = np.sum((moved - substeps * chance) ** 2 / (substeps * chance * (1 - chance)))
     assert statistic < stats.chi2.isf(1e-6, cells)
     assert statistic > stats.chi2.isf(1 - 1e-6, cells)
 
@@ -354,7 +357,7 @@ def test_swap_chance_of_every_pair_of_sizes():
 
 
 def mean_field(values, pairs, chances):
-    """One pass: E s <- prod_e (I - P L_e) E s, edges in order."""
+    """One substep: E s <- prod_e (I - P L_e) E s, edges in order."""
     values = np.array(values, float)
     for (i, j), chance in zip(pairs, chances, strict=True):
         flow = chance * (values[j] - values[i])
@@ -370,7 +373,7 @@ RING = [(0, 1), (2, 1), (2, 3), (4, 3), (0, 4), (1, 3)]
 def test_a9_mean_sizes_follow_the_mean_field(scale):
     """A network of five boxes, a probability for each edge. Counts of one size in a box are binomial.
 
-    5 boxes, 8 passes, 5 sigma: by chance once in 43,000 tests.
+    5 boxes, 8 substeps, 5 sigma: by chance once in 43,000 tests.
     """
     cells = sized(20_000, 800)
     chances = scale * np.array([0.1, 0.25, 0.4, 0.05, 0.3, 0.15])
@@ -415,18 +418,11 @@ def test_slots_decide_which_parcels_swap():
 
 
 def test_passes_share_the_edges_evenly():
-    """Edge e takes part in passes[e] of most_passes; with P = 1 each turn is seen as an exchange of two parcels."""
+    """Edge e takes part in substeps[e] of most_passes; with P = 1 each turn is seen as an exchange of two parcels."""
     for most in (1, 3, 7):
         for own in range(1, most + 1):
-            turns = []
-            for number in range(most):
-                column = halves(4, mixing=1.0)
-                swaps = kernels.swap(
-                    column.sizes, column.streams, column.reach, column.block_reach, column.stale,
-                    column.sizes.max(axis=1), column.slots, np.zeros(2, bool), column.pairs, column.rise,
-                    column.mixing, np.array([own]), most, column.means, number, np.uint64(1), 1 / 0.06, 1e-6,
-                )  # fmt: skip
-                turns.append(swaps == 4)
+            column = halves(4, mixing=1.0)
+            turns = [column.swap(substeps=own, most=most, number=number) == 4 for number in range(most)]
             assert sum(turns) == own
             assert turns == [takes_part(number, own, most) for number in range(most)]
 
@@ -438,11 +434,11 @@ def guarded(chance, cells, steps):
     """Share of the upper box over time, each step split as the lattice splits it."""
     column = halves(cells, mixing=0.0, seed=8)
     rates = SwapRates(column.pairs, np.zeros(1), np.array([chance]))
-    passes = int(exchange.passes_needed(rates, rates.mixing, column.means, 2.0)[0])
-    column.mixing = rates.mixing / passes
+    substeps = int(lattice.substeps_needed(rates, rates.mixing, column.means, 2.0)[0])
+    column.mixing = rates.mixing / substeps
     shares = []
     for _ in range(steps):
-        column.swap(passes)
+        column.swap(substeps)
         shares.append(np.mean(column.sizes[1] == 2))
     return np.array(shares)
 
@@ -456,7 +452,7 @@ def test_guard_keeps_swaps_from_overshooting(chance, monkeypatch):
     cells = sized(20_000, 2_000)
     noise = 6 * 0.5 / math.sqrt(cells)
     assert guarded(chance, cells, 4).min() > 0.5 - noise
-    monkeypatch.setattr(exchange, "LARGEST_SUM", INF)
+    monkeypatch.setattr(lattice, "LARGEST_SUM", INF)
     free = guarded(chance, cells, 4)
     assert free[0] < 0.5 - noise  # overshoots
     assert np.allclose(free, 0.5 + (1 - 2 * chance) ** np.arange(1, 5) / 2, atol=noise)
@@ -465,9 +461,9 @@ def test_guard_keeps_swaps_from_overshooting(chance, monkeypatch):
 
 
 def test_guard_counts_every_edge_of_a_cell():
-    """A cell with four edges of 0.3 would swap 1.2 times a step: three passes, though no edge is above 1/2."""
+    """A cell with four edges of 0.3 would swap 1.2 times a step: three substeps, though no edge is above 1/2."""
     star = SwapRates(np.array([[0, k] for k in range(1, 5)]), np.zeros(4), np.full(4, 0.3))
-    assert exchange.passes_needed(star, star.mixing, np.full(5, 0.02), 0.06).tolist() == [3] * 4
+    assert lattice.substeps_needed(star, star.mixing, np.full(5, 0.02), 0.06).tolist() == [3] * 4
 
 
 # --- diffusion against the error function ------------------------------------------------------------------
@@ -482,14 +478,10 @@ def chain_rate(number, shear, time_step):
     speed = scene.rolls.speed * scene.rolls.diameter / 2
     width, height = scene.rolls.gap / 4, speed * time_step
     flat = np.zeros((2, number))
-    motion = flow.Motion(flat, flat, np.zeros(number), flat, flat, flat + shear / math.sqrt(3), time_step)
-    state = prepared(paper())[1]._replace(solid_fraction=flat + 0.7)
     pairs = np.column_stack([np.arange(number - 1), np.arange(1, number)])
-    edges = len(pairs)
-    cells = tessellation.Tessellation(
-        flat, pairs, np.full(edges, width), np.tile([0.0, 1.0], (edges, 1)), np.full(edges, height), None, None
-    )
-    return exchange.swap_rates(scene, motion, state, cells).mixing[0], height
+    edge = pairs, np.full(len(pairs), width), np.tile([0.0, 1.0], (len(pairs), 1)), np.full(len(pairs), height)
+    bed = bed_of(flat + shear / math.sqrt(3), time_step, flat + 0.7, *edge)
+    return swap_rates(scene, bed).mixing[0], height
 
 
 MEAN = 0.02
@@ -503,10 +495,10 @@ def test_rate_of_a_uniform_column_is_diffusivity_times_dt_over_d2():
         assert rate * MEAN**2 == pytest.approx(DIFFUSIVITY * time_step / height**2, rel=1e-12)
 
 
-def step_profile(boxes, chance, passes):
+def step_profile(boxes, chance, substeps):
     share = np.repeat([1.0, 0.0], boxes // 2)
     pairs = [(k, k + 1) for k in range(boxes - 1)]
-    for _ in range(passes):
+    for _ in range(substeps):
         share = mean_field(share, pairs, [chance] * (boxes - 1))
     return share
 
@@ -519,25 +511,25 @@ def error_function(boxes, spread):
 
 
 def test_variance_of_a_tracer_grows_by_exactly_2p_over_1_minus_p():
-    """Edges in order carry a cell up several boxes in one pass, and down one; on the average it stays.
+    """Edges in order carry a cell up several boxes in one substep, and down one; on the average it stays.
 
     Its mean displacement is -P + (1 - P)(P + P^2 + ...) = 0, its variance 2P / (1 - P): diffusion is that of
-    P / (1 - P), an error of first order in the time step which the passes keep below P = 1/2.
+    P / (1 - P), an error of first order in the time step which the substeps keep below P = 1/2.
     """
-    boxes, passes = 81, 10
+    boxes, substeps = 81, 10
     for chance in (0.01, 0.1, 0.25):
         share = np.zeros(boxes)
         share[boxes // 2] = 1.0
         pairs = [(k, k + 1) for k in range(boxes - 1)]
-        for _ in range(passes):
+        for _ in range(substeps):
             share = mean_field(share, pairs, [chance] * len(pairs))
         place = np.arange(boxes) - boxes // 2
         assert share @ place == pytest.approx(0, abs=1e-9)
-        assert share @ place**2 == pytest.approx(passes * 2 * chance / (1 - chance), rel=1e-6)
+        assert share @ place**2 == pytest.approx(substeps * 2 * chance / (1 - chance), rel=1e-6)
 
 
 def test_diffusion_converges_to_the_error_function_at_order_1_in_dt_and_2_in_d():
-    # time: the same D t = 8 boxes squared in more and more passes, against the boxes' exact solution
+    # time: the same D t = 8 boxes squared in more and more substeps, against the boxes' exact solution
     boxes = 60
     laplacian = np.diag(np.r_[1.0, np.full(boxes - 2, 2.0), 1.0]) - np.eye(boxes, k=1) - np.eye(boxes, k=-1)
     start = np.repeat([1.0, 0.0], boxes // 2)
@@ -556,24 +548,24 @@ def test_diffusion_converges_to_the_error_function_at_order_1_in_dt_and_2_in_d()
     assert np.all(abs(orders - 2) < 0.4), orders
 
 
-@pytest.mark.parametrize(("square", "passes"), [(4.0, 400), (4.0, 40)])
-def test_swaps_diffuse_a_tracer_as_the_error_function(square, passes):
+@pytest.mark.parametrize(("square", "substeps"), [(4.0, 400), (4.0, 40)])
+def test_swaps_diffuse_a_tracer_as_the_error_function(square, substeps):
     """Every box within 5 sigma of the mean field and, with the mean field's own error added, of erfc.
 
     P = 0.01 is drawn by skipping, P = 0.1 cell by cell. 40 boxes, 5 sigma: by chance once in 40,000 tests.
     """
     boxes, cells = 40, sized(4_000, 100)
-    passes = passes if COMPILED else passes // 2
-    chance = square / passes
+    substeps = substeps if COMPILED else substeps // 2
+    chance = square / substeps
     rate, _ = chain_rate(boxes, 30.0, 1e-3)
     mean = math.sqrt(chance / rate)  # the mean size at which the column of swap_rates has this probability
     column = Column(
         np.repeat(np.repeat([2.0, 1.0], boxes // 2)[:, None], cells, axis=1), mixing=rate * mean**2, means=1.5, seed=9
     )
     assert column.mixing[0] == pytest.approx(chance)
-    column.swap(passes)
+    column.swap(substeps)
     found = np.mean(column.sizes == 2, axis=1)
-    expected = step_profile(boxes, chance, passes)
+    expected = step_profile(boxes, chance, substeps)
     noise = SIGMAS * np.sqrt(expected * (1 - expected) / cells) + 1e-3
     assert np.all(abs(found - expected) < noise)
     exact = error_function(boxes, 2 * math.sqrt(square))
@@ -597,20 +589,20 @@ def test_segregation_and_diffusion_reach_their_exact_balance(large, speed):
 
     Across an edge, a large grain below a small one rises at mixing + rise (L - m_below + m_above - S), and one
     above sinks at mixing, so every edge keeps the weights w_up / w_down = 1 + rise Delta / mixing, and so does
-    a pass over all edges. Counts of configurations against those weights, chi-square at 1e-6.
+    a substep over all edges. Counts of configurations against those weights, chi-square at 1e-6.
     """
     small, big, boxes = 0.01, 0.04, 4
     means = np.array([0.02, 0.022, 0.025, 0.028])
     delta = big - small + means[1:] - means[:-1]
     mixing, rise = np.array([0.2, 0.1, 0.15]), np.array([4.0, 5.0, 1.0])
-    passes, cells = 60, sized(20_000, 600)
+    substeps, cells = 60, sized(20_000, 600)
     if speed == "sparse":  # the same balance at probabilities that are skipped through
-        mixing, rise, passes, cells = mixing / 40, rise / 40, sized(2400, 1600), sized(20_000, 150)
+        mixing, rise, substeps, cells = mixing / 40, rise / 40, sized(2400, 1600), sized(20_000, 150)
         assert (mixing + rise * (big - means[:-1] + means[1:])).max() < kernels.DENSE
     sizes = np.full((boxes, cells), small)
     sizes[:large] = big  # all large grains start at the bottom
     column = Column(sizes, rise=rise, mixing=mixing, means=means, seed=10 + large)
-    column.swap(passes)
+    column.swap(substeps)
     at = column.sizes == np.float32(big)
     assert (at.sum(axis=0) == large).all()
     number = (at * 2 ** np.arange(boxes)[:, None]).sum(axis=0)
