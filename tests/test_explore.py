@@ -1,7 +1,6 @@
 import json
 import re
 import shutil
-import subprocess
 import sys
 from functools import cache
 from pathlib import Path
@@ -12,8 +11,10 @@ import xarray as xr
 from support import paper
 
 import hpgr
-from studies import explore, explore_data, report, store
-from studies.sweep import STATUS, sweep
+from hpgr.results.schema import STATUS
+from studies import explore
+from studies.show import page, report
+from studies.sweep import netcdf, sweep
 
 BASE = {"resolution.streamlines": 3, "resolution.points": 40, "resolution.cells": 60}
 NASTY = "odd: </script><img src=x onerror=alert(1)> & 'quoted' \u2028 <!-- <script>"
@@ -26,7 +27,7 @@ def refined(axes, replicates=2, base=None):
 
 @pytest.fixture(scope="module")
 def three():
-    """Three axes, the first unsorted and with a value that is refused; a note that is no safe HTML."""
+    """Three axes, the first unsorted and with a value that is refused; diagnostics that are no safe HTML."""
     axes = {
         "rolls.gap": ["60 mm", "40 mm", "1.2 m"],
         "feed.top_size": [0.03, 0.06],
@@ -34,15 +35,15 @@ def three():
     }
     result = refined(axes)
     lose(result, "boom <b>", gap=1, feed_top_size=0, roll_speed=0, replicate=1)
-    texts = result["notes"].values.astype(object)
+    texts = result["diagnostics"].values.astype(object)
     texts[0, 0, 0, 0] = f"{texts[0, 0, 0, 0]}\n{NASTY}".strip()
-    result["notes"] = (result["notes"].dims, texts)
+    result["diagnostics"] = (result["diagnostics"].dims, texts)
     return result
 
 
 SWEEPS = {
     "one": ({"rolls.gap": ["40 mm", "50 mm"]}, 2, {}),
-    "text": ({"stress.integrator": ["euler", "increment"], "material.cushioning": [0.5, np.inf]}, 1, {}),
+    "text": ({"elasticity.integrator": ["euler", "increment"], "strength.cushioning": [0.5, np.inf]}, 1, {}),
     "stress": ({"rolls.gap": ["40 mm", "50 mm"]}, 2, {"resolution.cells": 0}),
     "ragged": ({"resolution.streamlines": [2, 3]}, 2, {}),
     "none": ({}, 1, {"resolution.cells": 0}),
@@ -64,7 +65,7 @@ def saved(request, three, tmp_path_factory):
     """Return a sweep as a file holds it, and that file."""
     made = three if request.param == "three" else swept(request.param)
     path = tmp_path_factory.mktemp("saved") / f"{request.param}.nc"
-    store.write_dataset(made, path)
+    netcdf.write_dataset(made, path)
     return explore.opened(path), path
 
 
@@ -157,7 +158,7 @@ def test_every_scalar_of_a_sweep_is_a_figure():
         {"units": "1", "long_name": "passes"},
     )
     lose(result, "boom", gap=0, replicate=0)
-    kpis = {one["heading"]: one for one in explore_data.page_data(result, 1e-3, "x")["kpis"]}
+    kpis = {one["heading"]: one for one in page.page_data(result, 1e-3, "x")["kpis"]}
     agree(kpis["power [kW]"], flat(result, "power") / 1e3)
     assert kpis["power [kW]"]["about"] == "power of both rolls"
     assert kpis["passes"]["mean"] == [2, 4]  # of the replicate that is left: an integer has no NaN of its own
@@ -166,7 +167,7 @@ def test_every_scalar_of_a_sweep_is_a_figure():
 
 
 def test_axes_are_sorted_for_the_slider_and_rebuild_every_scene(three):
-    data = explore_data.page_data(three, 1e-3, "three")
+    data = page.page_data(three, 1e-3, "three")
     gap, top, speed = data["axes"]
     assert gap["texts"] == ["60 mm", "40 mm", "1200 mm"]
     assert gap["order"] == [1, 0, 2]
@@ -185,23 +186,25 @@ def test_axes_are_sorted_for_the_slider_and_rebuild_every_scene(three):
     assert data["start"] == [0, 1, 1]  # 60 mm, 60 mm and 20 rpm are nearest to the paper's machine
 
 
-def test_a_level_changes_all_it_stands_for():
-    base = paper(BASE)
-    changed = explore_data.changes(base, "resolution.level", "draft")
+def test_a_kind_of_law_changes_and_drops_its_fields():
+    """As the page puts a scene together: None takes a field out."""
+    base = paper(BASE | {"flow.exponent": 2.0})
+    found = page.changes(base, "flow", {"kind": "nip", "nip_angle": 0.1})
+    assert found["flow.exponent"] is None
     scene = json.loads(base.model_dump_json())
-    scene["resolution"] |= {name.partition(".")[2]: value for name, value in changed.items()}
-    assert hpgr.Scene.model_validate(scene) == base.with_values({"resolution.level": "draft"})
-    assert len(changed) > 1
+    scene["flow"] |= {name.partition(".")[2]: value for name, value in found.items()}
+    scene["flow"] = {key: value for key, value in scene["flow"].items() if value is not None}
+    assert hpgr.Scene.model_validate(scene) == base.with_values({"flow": {"kind": "nip", "nip_angle": 0.1}})
 
 
 def test_infinite_and_text_axes_are_categories():
-    integrator, cushioning = explore_data.page_data(swept("text"), 1e-3, "x")["axes"]
+    integrator, cushioning = page.page_data(swept("text"), 1e-3, "x")["axes"]
     assert (integrator["values"], integrator["texts"]) == (None, ["euler", "increment"])
     assert (cushioning["values"], cushioning["texts"], cushioning["raw"]) == (None, ["0.5", "inf"], [0.5, "inf"])
 
 
 def test_every_operating_point_tells_its_limits_and_losses(three):
-    data = explore_data.page_data(three, 1e-3, "three")
+    data = page.page_data(three, 1e-3, "three")
     assert np.array(data["held"]).reshape(3, 2, 2).tolist() == [[[2, 2], [2, 2]], [[1, 2], [2, 2]], [[0, 0], [0, 0]]]
     said = data["said"]
     assert said[4][0] == ["failed", 1, "boom <b>"]
@@ -215,7 +218,7 @@ def test_every_operating_point_tells_its_limits_and_losses(three):
 
 
 def test_feeds_follow_the_axis_of_the_feed(three):
-    data = explore_data.page_data(three, 1e-3, "three")
+    data = page.page_data(three, 1e-3, "three")
     sizes = np.array(data["sieves"]) * 1e-3
     assert data["feed_of"] == [0, 0, 1, 1] * 3
     for found, top in zip(data["feeds"], [0.03, 0.06], strict=True):
@@ -225,7 +228,7 @@ def test_feeds_follow_the_axis_of_the_feed(three):
 
 def test_a_sieve_between_the_recorded_ones_is_interpolated_in_the_log():
     result = swept("one")
-    data = explore_data.page_data(result, 1.1e-3, "x")
+    data = page.page_data(result, 1.1e-3, "x")
     assert data["sieves"][data["sieve"]] == 1.1
     found = array(data["passing"]["passing_total"]["mean"], 2, -1)[:, data["sieve"]]
     logs = np.log(result["sieve"].values)
@@ -234,43 +237,37 @@ def test_a_sieve_between_the_recorded_ones_is_interpolated_in_the_log():
 
 
 def test_text_of_a_sweep_cannot_leave_its_place(three):
-    page = explore.page_of(explore_data.page_data(three, 1e-3, "<x> & @@DATA@@"), "let a = '@@TITLE@@';")
-    assert page.count("</script") == 3  # data, library, page
-    assert "onerror=alert" not in re.sub(r'<script type="application/json".*?</script>', "", page, flags=re.DOTALL)
-    assert "<title>&lt;x&gt; &amp; @@DATA@@ - hpgr explorer</title>" in page
-    data = embedded(page)
+    data = page.page_data(three, 1e-3, "<x> & @@DATA@@")
+    text = page.page_of(data, "let a = '@@TITLE@@';", 'explore "a.nc"')
+    assert text == page.page_of(data, "let a = '@@TITLE@@';", 'explore "a.nc"')  # the same bytes
+    assert text.count("</script") == 3  # data, library, page
+    assert "onerror=alert" not in re.sub(r'<script type="application/json".*?</script>', "", text, flags=re.DOTALL)
+    assert "<title>&lt;x&gt; &amp; @@DATA@@ - hpgr explorer</title>" in text
+    assert '<meta name="generator" content="explore &quot;a.nc&quot;">' in text
+    data = embedded(text)
     assert data["name"] == "<x> & @@DATA@@"
     assert any(what == "odd" and "</script><img src=x" in text for what, _, text in data["said"][0])
 
 
 def test_page_names_nothing_to_fetch():
-    template = (Path(explore.__file__).parent / "explore_page.html").read_text(encoding="utf-8")
+    template = (Path(page.__file__).parent / "page.html").read_text(encoding="utf-8")
     assert not re.findall(r"https?:|//[a-z]+\.|url\(|@import|\bfetch\(|XMLHttpRequest|<script src|<iframe", template)
     assert "default-src 'none'" in template
-
-
-def test_same_sweep_same_bytes(three):
-    data = explore_data.page_data(three, 1e-3, "three")
-    assert explore.page_of(data, "library") == explore.page_of(data, "library")
-
-
-def test_too_large_for_a_page(three, monkeypatch):
-    monkeypatch.setattr(explore_data, "MOST_NUMBERS", 1000)
-    with pytest.raises(ValueError, match=r"big.nc: 12 operating points of \d+ means.* at most 1e\+03.*isel\(gap="):
-        explore_data.page_data(three, 1e-3, "big.nc")
 
 
 def test_most_numbers_counts_what_is_embedded(three, monkeypatch):
     def count(value):
         return len(value["mean"]) + len(value["sd"])
 
-    data = explore_data.page_data(three, 1e-3, "three")
+    data = page.page_data(three, 1e-3, "three")
     total = sum(map(count, [*data["kpis"], *data["profiles"], *data["passing"].values()]))
-    monkeypatch.setattr(explore_data, "MOST_NUMBERS", int(0.9 * total))
-    with pytest.raises(ValueError, match="a page holds at most"):
-        explore_data.page_data(three, 1e-3, "three")
-    monkeypatch.setattr(explore_data, "MOST_NUMBERS", int(1.2 * total))
-    explore_data.page_data(three, 1e-3, "three")
+    monkeypatch.setattr(page, "MOST_NUMBERS", int(1.2 * total))
+    page.page_data(three, 1e-3, "three")
+    monkeypatch.setattr(page, "MOST_NUMBERS", int(0.9 * total))
+    with pytest.raises(
+        ValueError, match=r"big.nc: 12 operating points of \d+ means.* a page holds at most.*isel\(gap="
+    ):
+        page.page_data(three, 1e-3, "big.nc")
 
 
 @pytest.fixture
@@ -290,60 +287,38 @@ def refused(capsys, tmp_path, monkeypatch):
     return call
 
 
-def test_no_such_file(refused):
+def test_files_without_a_sweep_are_refused(refused, tmp_path):
     assert "gone.nc: there is no such file; make one first" in refused("gone.nc")
-
-
-def test_no_netcdf(refused, tmp_path):
     (tmp_path / "table.nc").write_text("gap,p80\n")
     assert "table.nc: cannot be read as NetCDF" in refused("table.nc")
-
-
-def test_no_sweep(refused, tmp_path):
-    store.write_dataset(hpgr.simulate(paper(BASE | {"resolution.record": "product"})), tmp_path / "run.nc")
+    netcdf.write_dataset(hpgr.simulate(paper(BASE | {"resolution.record": "product"})), tmp_path / "run.nc")
     message = refused("run.nc")
-    assert "run.nc: is not the result of a sweep: it lacks replicate, status, message, notes" in message
+    assert "run.nc: is not the result of a sweep: it lacks replicate, status, message, diagnostics" in message
     assert "python -m studies.gap_sweep" in message
     xr.Dataset({"a": 1}).to_netcdf(tmp_path / "other.nc")
     assert "the attribute scene" in refused("other.nc")
-
-
-def test_nothing_held(refused, tmp_path):
-    store.write_dataset(refined({"rolls.gap": ["1.2 m"]}), tmp_path / "lost.nc")
+    netcdf.write_dataset(refined({"rolls.gap": ["1.2 m"]}), tmp_path / "lost.nc")
     assert "lost.nc: no case holds a result, so there is nothing to show; the first: refused: gap 1200" in refused(
         "lost.nc"
     )
 
 
-def test_bad_options(refused, tmp_path):
-    store.write_dataset(swept("one"), tmp_path / "one.nc")
+def test_a_file_with_values_elsewhere_is_refused_unread(refused, tmp_path):
+    import h5py
+
+    (tmp_path / "secret").write_bytes(bytes(64))
+    with h5py.File(tmp_path / "sly.nc", "w") as file:
+        file.create_dataset("status", (8,), "f8", external=[(str(tmp_path / "secret"), 0, 64)])
+    assert "/status has its values in other files" in refused("sly.nc")
+
+
+def test_bad_options_are_refused(refused, tmp_path, monkeypatch):
+    netcdf.write_dataset(swept("one"), tmp_path / "one.nc")
     assert "--sieve: got '1'; text without a unit" in refused("one.nc", "--sieve", "1")
     assert "--sieve: got 3000 mm; must lie within" in refused("one.nc", "--sieve", "3 m")
     assert "--out: got 'one.nc'; must end with .html" in refused("one.nc", "--out", "one.nc")
-    (tmp_path / "file").touch()
-    assert "file" in refused("one.nc", "--out", "file/page.html")
-
-
-def test_without_the_library_the_remedy_is_named(refused, monkeypatch):
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
-    assert "pip install 'plotly>=6'" in refused("any.nc")
-
-
-def test_help_loads_nothing_heavy():
-    code = (
-        "import sys; from studies import explore\ntry: explore.main(['--help'])\nexcept SystemExit: print(*sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
-    assert "--sieve" in done.stdout
-    assert "--out" in done.stdout
-    late = {"numba", "xarray", "matplotlib", "distributed", "dask", "netCDF4", "scipy", "pint", "plotly"}
-    assert not late & set(done.stdout.splitlines()[-1].split())
-
-
-def test_the_template_is_packaged():
-    from importlib.resources import files
-
-    assert (files("studies") / "explore_page.html").is_file()
+    assert "pip install 'plotly>=6'" in refused("one.nc")
 
 
 # In a browser ---------------------------------------------------------------------------------------------------
@@ -363,10 +338,18 @@ def browser(tmp_path_factory):
     options = webdriver.ChromeOptions()
     options.binary_location = BROWSER
     for flag in (
-        "headless=new", "no-sandbox", "disable-gpu", "disable-quic", "no-first-run", "disable-background-networking",
-        "disable-component-update", "disable-sync", "disable-dev-shm-usage", "window-size=1280,900",
+        "headless=new",
+        "no-sandbox",
+        "disable-gpu",
+        "disable-quic",
+        "no-first-run",
+        "disable-background-networking",
+        "disable-component-update",
+        "disable-sync",
+        "disable-dev-shm-usage",
+        "window-size=1280,900",
         f"user-data-dir={tmp_path_factory.mktemp('profile')}",
-    ):  # fmt: skip
+    ):
         options.add_argument(f"--{flag}")
     downloads = tmp_path_factory.mktemp("downloads")
     options.add_experimental_option("prefs", {"download.default_directory": str(downloads)})
@@ -408,8 +391,11 @@ class Page:
 
     def figure(self, heading):
         """Return the cells of a row of the table, selected point first."""
-        [row] = [row for row in self.driver.find_elements("css selector", "#kpis tbody tr")
-                 if row.get_attribute("data-figure") == heading]  # fmt: skip
+        [row] = [
+            row
+            for row in self.driver.find_elements("css selector", "#kpis tbody tr")
+            if row.get_attribute("data-figure") == heading
+        ]
         return [cell.text for cell in row.find_elements("tag name", "td")]
 
     def traces(self, chart):
@@ -423,10 +409,10 @@ class Page:
 def opened_in(browser, path):
     browser.get_log("performance"), browser.get_log("browser")  # of the page before
     browser.get(path.as_uri())
-    page = Page(browser)
-    page.wait("return document.body.dataset.drawn || !document.getElementById('trouble').hidden")
-    assert page.text("trouble") == ""
-    return page
+    tab = Page(browser)
+    tab.wait("return document.body.dataset.drawn || !document.getElementById('trouble').hidden")
+    assert tab.text("trouble") == ""
+    return tab
 
 
 def requests(browser):
@@ -436,13 +422,14 @@ def requests(browser):
     return [url for url in found if not url.startswith(("data:", "blob:"))]
 
 
+@pytest.mark.slow
 def test_a_user_moves_sliders_and_pins_points(browser, three, tmp_path):
     from selenium.webdriver.common.keys import Keys
 
-    store.write_dataset(three, tmp_path / "three.nc")
+    netcdf.write_dataset(three, tmp_path / "three.nc")
     assert explore.main([str(tmp_path / "three.nc")]) == 0
     path = tmp_path / "three.html"
-    page = opened_in(browser, path)
+    tab = opened_in(browser, path)
 
     def expected(name, factor, *place):
         return three[name].values[place].astype(float).mean(axis=0) * factor
@@ -451,79 +438,79 @@ def test_a_user_moves_sliders_and_pins_points(browser, three, tmp_path):
         """Assert that table and charts show an operating point."""
         columns = {"P80 [mm]": ("p80_total", 1e3), "throughput [t/h]": ("throughput", 3.6)}
         for heading, (name, factor) in columns.items():
-            mean, spread = map(float, page.figure(heading)[0].split(" ± "))
+            mean, spread = map(float, tab.figure(heading)[0].split(" ± "))
             values = three[name].values[place].astype(float) * factor
             assert mean == pytest.approx(values.mean(), rel=6e-4)
             assert spread == pytest.approx(values.std(ddof=1), rel=0.06, abs=1e-6)
-        across = page.traces("across")[-1]
+        across = tab.traces("across")[-1]
         assert across["x"] == pytest.approx([*-three["xi"].values[::-1], *three["xi"].values], rel=1e-5)
         p80 = expected("p80", 1e3, *place)
         assert across["y"] == pytest.approx([*p80[::-1], *p80], rel=1e-5)
         pressure = expected("streamline_peak_pressure", 1e-6, *place)
-        assert page.traces("pressure")[-1]["y"] == pytest.approx([*pressure[::-1], *pressure], rel=1e-5)
-        [sizes] = [trace for trace in page.traces("sizes") if trace["name"].startswith("selected")]
+        assert tab.traces("pressure")[-1]["y"] == pytest.approx([*pressure[::-1], *pressure], rel=1e-5)
+        [sizes] = [trace for trace in tab.traces("sizes") if trace["name"].startswith("selected")]
         known = np.interp(sizes["x"], three["sieve"].values * 1e3, 100 * expected("passing_total", 1, *place))
         drawn = np.array([0.0 if value is None else value for value in sizes["y"]])
         assert drawn == pytest.approx(known, rel=1e-4)
 
-    assert page.text("axis-gap-shown") == "60 mm"
+    assert tab.text("axis-gap-shown") == "60 mm"
     shows(0, 1, 1)
-    before = page.traces("across")[-1]["y"]
+    before = tab.traces("across")[-1]["y"]
     slider = browser.find_element("id", "axis-gap")
     assert (slider.get_attribute("aria-label"), slider.get_attribute("aria-valuetext")) == ("gap", "60 mm")
 
-    page.click("pin")  # 60 mm stays, as A
-    page.press("axis-gap", Keys.ARROW_LEFT)
-    assert page.text("axis-gap-shown") == slider.get_attribute("aria-valuetext") == "40 mm"
+    tab.click("pin")  # 60 mm stays, as A
+    tab.press("axis-gap", Keys.ARROW_LEFT)
+    assert tab.text("axis-gap-shown") == slider.get_attribute("aria-valuetext") == "40 mm"
     shows(1, 1, 1)
-    pinned, now = page.traces("across")
+    pinned, now = tab.traces("across")
     assert pinned["y"] == before
     assert now["y"] != before
     assert {"dash", "symbol"} <= {key for key in now if now[key] != pinned[key]}  # told apart without colour
-    assert len(page.figure("P80 [mm]")) == 2
-    assert "A: 60 mm, 60 mm, 20 rpm" in page.text("points")
+    assert len(tab.figure("P80 [mm]")) == 2
+    assert "A: 60 mm, 60 mm, 20 rpm" in tab.text("points")
 
     # against the axis: one line for both, with a bar at each gap that holds a result
-    line, *_ = page.traces("curve2")
+    line, *_ = tab.traces("curve2")
     assert line["x"] == [40, 60]
     values = three["p80_total"].values[[1, 0], 1, 1].astype(float) * 1e3
     assert line["y"] == pytest.approx(values.mean(axis=1), rel=1e-5)
     assert line["bars"] == pytest.approx(values.std(axis=1, ddof=1), rel=1e-3)
 
     # another sieve
-    old = page.figure("below")[0]
-    page.press("sieve", Keys.ARROW_RIGHT)
-    assert page.text("sieve-shown") != "1 mm"
-    sieve = float(page.text("sieve-shown").split()[0])
+    old = tab.figure("below")[0]
+    tab.press("sieve", Keys.ARROW_RIGHT)
+    assert tab.text("sieve-shown") != "1 mm"
+    sieve = float(tab.text("sieve-shown").split()[0])
     below = np.interp(np.log(sieve / 1e3), np.log(three["sieve"].values), expected("passing", 100, 1, 1, 1)[0])
-    assert page.traces("fineness")[-1]["y"][3] == pytest.approx(below, rel=5e-3)  # the sieve is shown to 4 digits
-    assert page.figure("below")[0] != old
+    assert tab.traces("fineness")[-1]["y"][3] == pytest.approx(below, rel=5e-3)  # the sieve is shown to 4 digits
+    assert tab.figure("below")[0] != old
 
     # a lost point says so, in words, and draws nothing
-    page.press("axis-gap", Keys.END)
-    assert page.text("axis-gap-shown") == "1200 mm"
-    assert "No result at this operating point" in page.text("said")
-    assert "refused (2 of 2 replicates): rolls.gap: got 1200 mm" in page.text("said")
-    assert page.figure("P80 [mm]")[0] == "–"
-    assert len(page.traces("across")) == 1  # the pin
+    tab.press("axis-gap", Keys.END)
+    assert tab.text("axis-gap-shown") == "1200 mm"
+    assert "No result at this operating point" in tab.text("said")
+    assert "refused (2 of 2 replicates): rolls.gap: got 1200 mm" in tab.text("said")
+    assert tab.figure("P80 [mm]")[0] == "–"
+    assert len(tab.traces("across")) == 1  # the pin
 
-    # notes are text, whatever they hold
+    # diagnostics are text, whatever they hold
     for name, key in {"gap": Keys.ARROW_LEFT, "feed_top_size": Keys.HOME, "roll_speed": Keys.HOME}.items():
-        page.press(f"axis-{name}", key)
-    assert page.text("axis-gap-shown") == "60 mm"
-    assert "</script><img src=x onerror=alert(1)>" in page.text("said")
+        tab.press(f"axis-{name}", key)
+    assert tab.text("axis-gap-shown") == "60 mm"
+    assert "</script><img src=x onerror=alert(1)>" in tab.text("said")
     assert browser.find_elements("tag name", "img") == []
 
     # the scene of the selected point
-    scene = hpgr.Scene.model_validate_json(page.run("return document.getElementById('scene').textContent"))
+    scene = hpgr.Scene.model_validate_json(tab.run("return document.getElementById('scene').textContent"))
     own = {"rolls.gap": 0.06, "feed.top_size": 0.03, "rolls.speed": three["roll_speed"].values[0]}
     assert scene == hpgr.Scene.model_validate_json(three.attrs["scene"]).with_values(own)
 
     # compare along an axis, and take the pins away
-    page.click("every-roll_speed")
-    assert page.text("points").count("rpm") == 3
-    page.click("unpin")
-    assert page.text("points") == "Selected: 60 mm, 30 mm, 10 rpm"
+    tab.click("every-roll_speed")
+    assert tab.text("points").count("rpm") == 3
+    tab.click("unpin")
+    assert tab.text("points") == "Selected: 60 mm, 30 mm, 10 rpm"
 
     # the download
     browser.find_element("id", "csv").click()
@@ -533,15 +520,15 @@ def test_a_user_moves_sliders_and_pins_points(browser, three, tmp_path):
     [p80] = [row for row in rows if row[3:6] == ["P80", "mm", ""]]
     assert p80[:3] == ["60", "30", "10"]
     assert float(p80[7]) == pytest.approx(float(expected("p80_total", 1e3, 0, 0, 0)), rel=1e-5)
-    assert sum(row[3] == "fraction passing (whole gap)" for row in rows) == len(page.traces("sizes")[0]["x"])
+    assert sum(row[3] == "fraction passing (whole gap)" for row in rows) == len(tab.traces("sizes")[0]["x"])
 
     # printed two charts in a row, and afterwards as wide as before
     width = "document.querySelector('#across .main-svg').getBoundingClientRect().width"
-    before = page.run(f"return {width}")
-    page.run("window.dispatchEvent(new Event('beforeprint'))")
-    page.wait(f"return {width} < 320")
-    page.run("window.dispatchEvent(new Event('afterprint'))")
-    page.wait(f"return Math.abs({width} - {before}) < 2")
+    before = tab.run(f"return {width}")
+    tab.run("window.dispatchEvent(new Event('beforeprint'))")
+    tab.wait(f"return {width} < 320")
+    tab.run("window.dispatchEvent(new Event('afterprint'))")
+    tab.wait(f"return Math.abs({width} - {before}) < 2")
 
     # on a phone
     small = {"width": 360, "height": 740, "deviceScaleFactor": 2, "mobile": True}
@@ -550,12 +537,12 @@ def test_a_user_moves_sliders_and_pins_points(browser, three, tmp_path):
         right = (
             "[...document.querySelectorAll('.chart .main-svg, .card')].map(one => one.getBoundingClientRect().right)"
         )
-        page.wait(f"return Math.max(...{right}) <= 360")
-        assert page.run("return document.documentElement.scrollWidth") <= 360
+        tab.wait(f"return Math.max(...{right}) <= 360")
+        assert tab.run("return document.documentElement.scrollWidth") <= 360
     finally:
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
-    assert page.run("return performance.getEntriesByType('resource').map(entry => entry.name)") == []
+    assert tab.run("return performance.getEntriesByType('resource').map(entry => entry.name)") == []
     assert requests(browser) == [path.as_uri()]
     assert browser.get_log("browser") == []
 
@@ -570,21 +557,22 @@ def waited(path):
     raise AssertionError(f"{path.name} was not downloaded")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["text", "ragged", "none"])
 def test_every_kind_of_sweep_opens_without_complaint(browser, kind, tmp_path):
     result, path = swept(kind), tmp_path / f"{kind}.nc"
-    store.write_dataset(result, path)
+    netcdf.write_dataset(result, path)
     assert explore.main([str(path)]) == 0
-    page = opened_in(browser, path.with_suffix(".html"))
+    tab = opened_in(browser, path.with_suffix(".html"))
     charts = {element.get_attribute("id") for element in browser.find_elements("css selector", ".chart")}
     assert ("sizes" in charts) == ("passing_total" in result)
     assert ("fineness" in charts) == ("passing" in result)
     assert ("pressure" in charts) == ("streamline_peak_pressure" in result)
     assert ("curve1" in charts) == bool(report.axes_of(result))
     for chart in charts:
-        assert page.traces(chart)
-        assert any(value is not None for value in page.traces(chart)[-1]["y"])
+        assert tab.traces(chart)
+        assert any(value is not None for value in tab.traces(chart)[-1]["y"])
     for axis in embedded(path.with_suffix(".html").read_text(encoding="utf-8"))["axes"]:
-        assert page.text(f"axis-{axis['name']}-shown") in axis["texts"]
+        assert tab.text(f"axis-{axis['name']}-shown") in axis["texts"]
     assert browser.get_log("browser") == []
     assert requests(browser) == [path.with_suffix(".html").as_uri()]
