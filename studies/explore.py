@@ -46,7 +46,7 @@ def main(options: Options) -> Report:
     def write(path: Path, history: str) -> None:
         path.write_text(page_of(data, library, history), encoding="utf-8")
 
-    return Report(["open it in a browser"], [write])
+    return Report(parts=[write])
 
 
 def chart_library() -> str:

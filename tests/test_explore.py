@@ -119,7 +119,7 @@ def agree(found, values, factor=1.0):
 def test_page_holds_the_numbers_of_the_file(saved, capsys):
     result, path = saved
     assert explore.main([str(path)]) == 0
-    assert capsys.readouterr().out.startswith(f"wrote {path.with_suffix('.html')} (")
+    assert capsys.readouterr().out == f"wrote {path.with_suffix('.html')}\n"
     data = embedded(path.with_suffix(".html").read_text(encoding="utf-8"))
     assert data["name"] == path.name
     axes = report.axes_of(result)
