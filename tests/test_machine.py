@@ -278,7 +278,7 @@ def test_gap_to_force_and_back(scene):
     """The nip angle of a cake density is that at the scene's own gap, so it comes back to itself."""
     force = machine.specific_pressing_force(scene)
     assert operating_gap(scene, force) == pytest.approx(scene.rolls.gap, rel=2e-9)
-    assert operating_gap(scene, f"{force / 1e6!r} N/mm^2") == pytest.approx(scene.rolls.gap, rel=2e-9)
+    assert operating_gap(scene, f"{float(force) / 1e6!r} N/mm^2") == pytest.approx(scene.rolls.gap, rel=2e-9)
 
 
 @floating

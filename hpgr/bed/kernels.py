@@ -32,14 +32,6 @@ class Line(NamedTuple):
     xi: float
 
 
-class Table(NamedTuple):
-    """Panels of a streamline: the places between them, exit to entry, the times to there from the exit, slowness."""
-
-    places: np.ndarray
-    times: np.ndarray
-    slowness: np.ndarray
-
-
 # --- motion -------------------------------------------------------------------------------------------------
 
 
@@ -140,53 +132,40 @@ def _travel(line, flow, start, length):
 
 
 @_compiled
-def _cut(line, flow):
-    """Return a table with the places between panels, which end at the nip, where the speed has a kink."""
-    places, half = np.empty(_PANELS + 1), _PANELS // 2
+def _panels(line, flow):
+    """Return the places between panels, exit to entry, on the mid-plane; the speed has a kink at the nip."""
+    edges = np.empty(_PANELS + 1)
     # high enough, on the mid-plane, that in the same time no tube begins below the nip, already compacted
     _, slope, _ = _shape(line, line.nip)
     top = max(line.height * (1 - flow.entry_fraction), line.nip * math.sqrt(1 + slope * slope))
     for k in range(_PANELS + 1):
-        if flow.nip_angle == 0:
-            places[k] = k * (-math.log(flow.entry_fraction) / _PANELS)
-        elif k <= half:
-            places[k] = k * (line.nip / half) / line.height
-        else:
-            places[k] = (line.nip + (k - half) * ((top - line.nip) / half)) / line.height
-    return Table(places, np.empty(_PANELS + 1), np.empty(_PANELS + 1))
+        share = 2 * k / _PANELS
+        past_nip = min(share, 1.0) * line.nip + max(share - 1, 0.0) * (top - line.nip)
+        edges[k] = past_nip / line.height if flow.nip_angle > 0 else -math.log(flow.entry_fraction) / 2 * share
+    return edges
 
 
 @_compiled
-def _tabulate(line, flow, table):
-    """Fill the times and slownesses of a streamline; return the travel time from the highest place, in H/U."""
-    places, total = table.places, 0.0
-    for k in range(_PANELS + 1):
-        table.slowness[k] = _slowness(line, flow, places[k])
-        if k > 0:
-            total += _travel(line, flow, places[k - 1], places[k] - places[k - 1])
-        table.times[k] = total
-    return total
-
-
-@_compiled
-def _march_back(line, flow, table, duration, places):
+def _march_back(line, flow, edges, duration, places):
     """Fill the places of a streamline's points, equal times apart, by Newton's method inside their panels."""
-    last, panel = places.size - 1, 0
-    for j in range(last, -1, -1):
-        wanted = duration * ((last - j) / last)
-        while panel < _PANELS - 1 and table.times[panel + 1] <= wanted:
-            panel += 1
-        start, left = table.places[panel], wanted - table.times[panel]
-        width, time = table.places[panel + 1] - start, table.times[panel + 1] - table.times[panel]
-        # the cubic through the panel's ends with their slopes is 1e-6 off; each pass squares that
-        u, low, high = left / time, time / table.slowness[panel] - width, time / table.slowness[panel + 1] - width
-        length = u * (width + (1 - u) * (low * (1 - u) - high * u))
-        for _ in range(4):
-            miss = _travel(line, flow, start, length) - left
-            length -= miss / _slowness(line, flow, start + length)
-            if abs(miss) <= 1e-7 * time:
-                break
-        places[j] = start + length
+    last = j = places.size - 1
+    passed, slow = 0.0, _slowness(line, flow, edges[0])
+    for k in range(_PANELS):
+        start, width, slow_start = edges[k], edges[k + 1] - edges[k], slow
+        time, slow = _travel(line, flow, start, width), _slowness(line, flow, edges[k + 1])
+        while j >= 0 and (duration * ((last - j) / last) < passed + time or k == _PANELS - 1):
+            left = duration * ((last - j) / last) - passed
+            # the cubic through the panel's ends with their slopes is 1e-6 off; each pass squares that
+            u, low, high = left / time, time / slow_start - width, time / slow - width
+            length = u * (width + (1 - u) * (low * (1 - u) - high * u))
+            for _ in range(4):
+                miss = _travel(line, flow, start, length) - left
+                length -= miss / _slowness(line, flow, start + length)
+                if abs(miss) <= 1e-7 * time:
+                    break
+            places[j] = start + length
+            j -= 1
+        passed += time
 
 
 @_compiled
@@ -228,13 +207,14 @@ def lay(bed, flow, surface_speed, y, speed, volumetric_rate, shear_rate, volumet
     """
     lines, points = y.shape
     middle = _line(bed, flow, 0.0)
-    table, places, unit_time = _cut(middle, flow), np.empty(points), bed.height / surface_speed
-    duration = _tabulate(middle, flow, table)
-    time_step, closest = duration * unit_time / (points - 1), math.inf
+    edges, places, unit_time = _panels(middle, flow), np.empty(points), bed.height / surface_speed
+    duration, closest = 0.0, math.inf
+    for k in range(_PANELS):
+        duration += _travel(middle, flow, edges[k], edges[k + 1] - edges[k])
+    time_step = duration * unit_time / (points - 1)
     for i in range(lines):
         line = _line(bed, flow, bed.xi[i])
-        _tabulate(line, flow, table)
-        _march_back(line, flow, table, duration, places)
+        _march_back(line, flow, edges, duration, places)
         for j in range(points):
             y[i, j], depth = _at(line, flow, places[j])
             relative, volumetric_rate[i, j], shear_rate[i, j] = _rates(line, flow, y[i, j], depth)

@@ -56,19 +56,9 @@ class BedInputs(NamedTuple):
 def inputs_of(scene: Scene, tessellated: bool = False) -> BedInputs:
     """Return what the bed of `scene` depends on."""
     rolls, bed, grid = scene.rolls, scene.bed, scene.resolution
-    return BedInputs(
-        rolls.diameter,
-        rolls.gap,
-        rolls.entry_gap,
-        rolls.speed,
-        scene.flow,
-        scene.elasticity,
-        bed.feed_solid_fraction,
-        bed.max_solid_fraction,
-        grid.streamlines,
-        grid.points,
-        tessellated,
-    )
+    machine = rolls.diameter, rolls.gap, rolls.entry_gap, rolls.speed
+    laws = scene.flow, scene.elasticity, bed.feed_solid_fraction, bed.max_solid_fraction
+    return BedInputs(*machine, *laws, grid.streamlines, grid.points, tessellated)
 
 
 class Pressed(NamedTuple):
