@@ -566,7 +566,7 @@ def test_swaps_diffuse_a_tracer_as_the_error_function(square, substeps):
     column.swap(substeps)
     found = np.mean(column.sizes == 2, axis=1)
     expected = step_profile(boxes, chance, substeps)
-    noise = SIGMAS * np.sqrt(expected * (1 - expected) / cells) + 1e-3
+    noise = SIGMAS * np.sqrt(expected * (1 - expected) / cells) + 2 / cells
     assert np.all(abs(found - expected) < noise)
     exact = error_function(boxes, 2 * math.sqrt(square))
     assert np.all(abs(found - exact) < noise + np.abs(expected - exact))
