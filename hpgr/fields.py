@@ -33,6 +33,7 @@ UNITS = {
     "rad": Unit("deg", 180 / math.pi, "rad", "9 deg"),
     "kg m-3": Unit("kg m-3", 1.0, "kg/m^3", "2.7 g/cm^3"),
     "N m": Unit("kN m", 1e-3, "N*m", "2 kN*m"),
+    "m s-1": Unit("m/s", 1.0, "m/s", "0.7 m/s"),
     "kg s-1": Unit("t/h", 3.6, "kg/s", "200 t/h"),
     "N": Unit("kN", 1e-3, "N", "900 kN"),
     "W": Unit("kW", 1e-3, "W", "300 kW"),
