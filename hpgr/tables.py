@@ -1,4 +1,8 @@
-"""Tables as a laboratory hands them over: a sieve table, and the two tables of a series of pilot tests."""
+"""Tables as a laboratory hands them over: a sieve analysis, and the two tables of a series of pilot tests.
+
+Columns are separated by commas, semicolons or tabs; without commas between them decimals may have one ("31,5"). Numbers
+may carry a % sign. Lines that start with # are comments, unless a mesh number follows.
+"""
 
 import csv
 import difflib
@@ -7,7 +11,9 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,25 +21,39 @@ import numpy as np
 
 from hpgr.fields import parse
 
-_UNIT_IN_HEADER = re.compile(r"^\s*(?:size|sieve|aperture)\w*?[\s_]*[\[(]?\s*([a-zµμ]+)\s*[\])]?\s*$", re.IGNORECASE)
 _LARGEST, _MOST_LINES, _LONGEST_LINE = 10_000_000, 10_000, 10_000  # bytes, lines, characters of a table
 _MOST_FAULTS = 50  # that are told at once
+_MOST_RETAINED = 5.0  # percent on the coarsest sieve, up to which the next sieve of the series is added
+_SERIES = (1, 1.12, 1.25, 1.4, 1.6, 1.8, 2, 2.24, 2.5, 2.8, 3.15, 3.55, 4, 4.5, 5, 5.6, 6.3, 7.1, 8, 9)  # R20, ISO 3
+_FORMAT = 'a sieve table has a column of sizes and one of percent passing, like "size_mm,percent_passing", "31.5,97.6"'
+_DECIMALS = "write decimals with a point, or columns apart by semicolons"
+_COMMENT = re.compile(r"\s*#(?!\s*\d)")
+_DECIMAL_COMMA = re.compile(r"([-+]?\d*),(\d+)(\s*%?)")
+_SIZE_HEADER = re.compile(r"size|sieve|aperture|opening|screen|mesh", re.IGNORECASE)
+_SIZE = re.compile(r"#?\s*(\d[\d./ e+-]*?|\.\d+)\s*([a-zµμ]*|\")", re.IGNORECASE)  # "1 1/2 in", "#200", "45 um"
+_UNITS = {'"': "inch", "in": "inch", "inches": "inch", "micron": "um", "microns": "um", "no": "mesh"}
+_NUMBERS = "4 5 6 7 8 10 12 14 16 18 20 25 30 35 40 45 50 60 70 80 100 120 140 170 200 230 270 325 400 450 500 635"
+_APERTURES = (
+    "4.75 4 3.35 2.8 2.36 2 1.7 1.4 1.18 1 .85 .71 .6 .5 .425 .355 .3 .25 .212 .18 .15 .125 .106 .09 .075 .063 .053 "
+    ".045 .038 .032 .025 .02"
+)
+_MESH = dict(zip(_NUMBERS.split(), map(float, _APERTURES.split()), strict=True))  # ASTM E11, mm
 
 
 def read_sieve_table(path: str | Path) -> list[tuple[float, float]]:
-    """Return rows (size in m, percent passing) of a CSV file, finest sieve first.
+    """Return rows (size in m, percent passing) of a file, finest sieve first.
 
-    The file has a header and two columns: the sieve size, its unit named in the header ("size_mm",
-    "size [mm]"), and the percent passing. Rows may run from fine to coarse or the other way.
-    Lines starting with # are comments.
+    The header names a column of sizes, with its unit ("size_mm", "Aperture [µm]", "mesh": ASTM E11) unless each size
+    has one, and a column "passing", or else "retained" or "cumulative retained", in percent or as fractions. Other
+    columns are left alone, and rows may stand in any order. If up to 5 % stay on the coarsest sieve, the next sieve of
+    the series is added, with a warning.
 
     Raises
     ------
     OSError
         If the file cannot be opened.
     ValueError
-        If the file cannot be read as such a table, naming the line. Whether the numbers make a
-        distribution is the feed's own check.
+        If the file cannot be read as such a table, naming the line.
 
     Examples
     --------
@@ -43,23 +63,119 @@ def read_sieve_table(path: str | Path) -> list[tuple[float, float]]:
     >>> rows[-1]
     (0.045, 100.0)
     """
-    (_, header), *rows = _lines(path)
-    metres = _metres_per_unit(header, path)
-    table = [_numbers(cells, number, path) for number, cells in rows]
-    table = [(size * metres, percent) for size, percent in table]
-    return table[::-1] if len(table) > 1 and table[0][0] > table[-1][0] else table
+    (head, header), *body = _lines(path)
+    try:
+        at, unit = _size_column(header)
+        of = _value_column(header)
+    except ValueError as error:
+        raise ValueError(f"{path}: line {head}, header {_short(','.join(header))}: {error}; {_FORMAT}") from None
+    found = []
+    for line, cells in body:
+        try:
+            if len(cells) != len(header):
+                raise ValueError(f"got {len(cells)} cells, the header has {len(header)}; {_DECIMALS}")
+            found.append(_sieve(line, cells, at, of, unit))
+        except (ValueError, ArithmeticError) as error:
+            raise ValueError(f"{path}: line {line} {_short(','.join(cells))}: {error}; {_FORMAT}") from None
+    rows = _passing(found, header[of].lower())
+    faults = list(_sieving_faults("the feed", rows, path, "size", ("passing",), 1e3))
+    if faults:
+        raise ValueError(f"{faults[0]}; {_FORMAT}")
+    table = [(row.values["size"], row.values["passing"]) for row in rows]
+    return table if table[-1][1] == 100 else [*table, (_next_sieve(path, rows, "size", 1e3), 100.0)]
+
+
+def _size_column(header: list[str]) -> tuple[int, str]:
+    """Return where the sizes stand and the unit that the header gives them, empty if it gives none."""
+    at = next((k for k, name in enumerate(header) if _SIZE_HEADER.search(name)), None)
+    if at is None:
+        raise ValueError("it names no column of sizes")
+    *before, last = re.findall(r'[a-zµμ]+|"', header[at].lower())
+    unit = _UNITS.get(last, last)
+    if unit != "mesh" and (not before or _SIZE_HEADER.fullmatch(unit)):
+        return at, ""
+    _metres_per(unit)
+    return at, unit
+
+
+def _value_column(header: list[str]) -> int:
+    found = [k for word in ("pass", "finer", "retain") for k, name in enumerate(header) if word in name.lower()]
+    if not found:
+        raise ValueError("it names no percent passing or retained")
+    return found[0]
+
+
+def _metres_per(unit: str) -> float:
+    try:
+        return 1e-3 if unit == "mesh" else parse(f"1 {unit}", "m")
+    except ValueError as error:
+        raise ValueError(f"{error}; give the sizes in a length such as mm") from None
+
+
+def _sieve(line: int, cells: list[str], at: int, of: int, unit: str) -> "_Row":
+    """Return the row; a pan has the size 0."""
+    size = 0.0 if cells[at].lower() == "pan" else _metres(cells[at], unit)
+    return _Row(line, "", {"size": size, "passing": _number(cells[of])})
+
+
+def _metres(text: str, unit: str) -> float:
+    """Return a size in m: a number, a fraction of an inch or a mesh number, with its own unit or the header's."""
+    found = _SIZE.fullmatch(text)
+    if not found:
+        raise ValueError("its size must be a number, a fraction of an inch or a mesh number")
+    own = _UNITS.get(found[2].lower(), found[2]) or ("mesh" if text.startswith("#") else unit)
+    if not own:
+        raise ValueError("name the unit of the sizes in the header")
+    if own == "mesh" and found[1] not in _MESH:
+        raise ValueError(f"its size must be a mesh number of ASTM E11: {', '.join(_MESH)}")
+    number = _MESH[found[1]] if own == "mesh" else sum(map(_part, found[1].split()))
+    return number * _metres_per(own)
+
+
+def _part(text: str) -> float:
+    return float(Fraction(text)) if "/" in text else float(text)
+
+
+def _passing(rows: list["_Row"], name: str) -> list["_Row"]:
+    """Return rows of percent passing, finest first and without the pan, of a column of this name."""
+    rows = sorted(rows, key=lambda row: row.values["size"])
+    values = np.array([row.values["passing"] for row in rows])
+    if "retain" in name and "cum" not in name:
+        values = np.cumsum(values[::-1])[::-1]
+    if values.max(initial=0.0) < 1.01 and not re.search("%|percent|pct", name):  # fractions
+        values = 100 * values
+    if "retain" in name:
+        values = np.clip(np.round(100 - values, 10), 0, 100)
+    kept = zip(rows, values.tolist(), strict=True)
+    return [row._replace(values=row.values | {"passing": value}) for row, value in kept if row.values["size"] > 0]
+
+
+def _next_sieve(path: str | Path, rows: list["_Row"], size: str, to_mm: float) -> float:
+    """Return the sieve above the coarsest of rows in their series, in their unit, and say that it is added."""
+    below, coarsest = (row.values[size] for row in rows[-2:])
+    wanted = coarsest**2 / below
+    decade = math.floor(math.log10(wanted))
+    known = [float(f"{number}e{power}") for power in (decade, decade + 1) for number in _SERIES]
+    found = min((one for one in known if one > 1.01 * coarsest), key=lambda one: abs(math.log(one / wanted)))
+    said = f"not all of the feed passes the coarsest sieve; the next of the series, {found * to_mm:g} mm, is added"
+    warnings.warn(f"{path}: line {rows[-1].line}: {said}", stacklevel=3)
+    return found
 
 
 def _lines(path: str | Path) -> list[tuple[int, list[str]]]:
     """Return (line number, stripped cells) of every line that is neither blank nor a comment; at least one."""
     text = _text_of(path)
-    kept = [(n, line) for n, line in enumerate(text.splitlines(), start=1) if not line.lstrip().startswith("#")]
+    kept = [(n, line) for n, line in enumerate(text.splitlines(), start=1) if not _COMMENT.match(line)]
     if max((len(line) for _, line in kept), default=0) > _LONGEST_LINE or len(kept) > _MOST_LINES:
         raise ValueError(
             f"{path}: got {len(kept):,} lines; a table has at most {_MOST_LINES:,} lines of {_LONGEST_LINE:,} "
             "characters; give the table alone"
         )
-    lines = [(n, [cell.strip() for cell in next(csv.reader([line]), [])]) for n, line in kept]
+    first = next((line for _, line in kept if line.strip()), "")
+    separator = next((mark for mark in ";\t" if mark in first), ",")
+    lines = [(n, [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]) for n, line in kept]
+    if separator != ",":
+        lines = [(n, [_DECIMAL_COMMA.sub(r"\1.\2\3", cell) for cell in cells]) for n, cells in lines]
     lines = [(n, cells) for n, cells in lines if any(cells)]
     if not lines:
         raise ValueError(f"{path}: the table is empty; give a header and rows")
@@ -83,28 +199,14 @@ def _text_of(path: str | Path) -> str:
     return text
 
 
-def _metres_per_unit(header: list[str], path: str | Path) -> float:
-    found = _UNIT_IN_HEADER.match(header[0]) if len(header) == 2 else None
-    if not found or "passing" not in header[1].lower():
-        raise ValueError(
-            f"{path}: header {_short(','.join(header))} is not 'size_<unit>,percent_passing'; "
-            "name the unit of the sizes, for example 'size_mm,percent_passing'"
-        )
+def _number(text: str) -> float:
     try:
-        return parse(f"1 {found[1]}", "m")
-    except ValueError as error:
-        raise ValueError(f"{path}: header {header[0]!r}: {error}; use a length such as mm") from None
-
-
-def _numbers(cells: list[str], line: int, path: str | Path) -> tuple[float, float]:
-    try:
-        size, percent = map(float, cells)
+        value = float(text.rstrip("% "))
     except ValueError:
-        text = _short(",".join(cells))
-        raise ValueError(
-            f"{path}: line {line} {text} is not two numbers (size, percent passing); correct or remove it"
-        ) from None
-    return size, percent
+        raise ValueError("must be a number") from None
+    if not math.isfinite(value):
+        raise ValueError("must be a finite number")
+    return value
 
 
 def _short(text: str) -> str:
@@ -218,7 +320,7 @@ def read_pilot_tests(product: str | Path, operations: str | Path) -> tuple[Pilot
     if sieves and runs:
         faults += _lonely_tests(sieves, runs, product, operations)
     for name, rows in sieves.items():
-        faults += _sieving_faults(name, rows, product)
+        faults += _sieving_faults(name, rows, product, "size_mm", ("feed", "centre", "edge", "total"), 1.0)
     for name, rows in runs.items():
         faults += [
             f"{operations}: line {row.line}, test: got {name!r} again (first in line {rows[0].line}); "
@@ -228,7 +330,7 @@ def read_pilot_tests(product: str | Path, operations: str | Path) -> tuple[Pilot
     if faults:
         told = [*faults[:_MOST_FAULTS], *(["..."] if len(faults) > _MOST_FAULTS else [])]
         raise ValueError(f"{len(faults)} fault(s) in the pilot tests:\n" + "\n".join(told))
-    return tuple(_pilot_test(name, run, sieves[name]) for name, [run] in runs.items())
+    return tuple(_pilot_test(name, run, sieves[name], product) for name, [run] in runs.items())
 
 
 def _rows(path: str | Path, columns: dict[str, _Column], faults: list[str]) -> list[_Row]:
@@ -274,7 +376,7 @@ def _row(line, header, cells, columns, path, faults) -> _Row | None:
     if len(cells) != len(header):
         faults.append(
             f"{path}: line {line}: got {len(cells)} cells; must be {len(header)} as in the header; "
-            "leave cells not measured empty, and write decimals with a point"
+            f"leave cells not measured empty; {_DECIMALS}"
         )
         texts = {}
     for name, text in texts.items():
@@ -292,11 +394,9 @@ def _value(text: str, column: _Column) -> float:
             raise ValueError("must be a number; fill it in or remove the row")
         return math.nan
     try:
-        value = float(text)
-    except ValueError:
-        raise ValueError("must be a number; leave the cell empty if not measured") from None
-    if not math.isfinite(value):
-        raise ValueError("must be a finite number; leave the cell empty if not measured")
+        value = _number(text)
+    except ValueError as error:
+        raise ValueError(f"{error}; leave the cell empty if not measured") from None
     if not column.holds(value):
         raise ValueError(f"{column.bound()}; correct the cell")
     return value
@@ -316,35 +416,42 @@ def _lonely_tests(sieves, runs, product, operations) -> Iterator[str]:
         yield f"{product}: test {name!r} of {operations} is missing; every test must be in both files; add its sieves"
 
 
-def _sieving_faults(name: str, rows: list[_Row], path: str | Path) -> Iterator[str]:
+def _sieving_faults(
+    name: str, rows: list[_Row], path: str | Path, size: str, columns: Sequence[str], to_mm: float
+) -> Iterator[str]:
     """Yield why the rows of one test are not size distributions."""
     if len(rows) < 2:
-        yield f"{path}: line {rows[0].line}, test: got one sieve for {name}; must be at least two; add sieves"
-    rows = sorted((row for row in rows if row.values["size_mm"] > 0), key=lambda row: row.values["size_mm"])
+        where = f"{path}: line {rows[0].line}, test" if rows else str(path)
+        yield f"{where}: got {len(rows) or 'no'} sieve for {name}; must be at least two; add sieves"
+        return
+    rows = sorted((row for row in rows if row.values[size] > 0), key=lambda row: row.values[size])
     for finer, coarser in itertools.pairwise(rows):
-        if finer.values["size_mm"] == coarser.values["size_mm"]:
+        if finer.values[size] == coarser.values[size]:
             yield (
-                f"{path}: line {coarser.line}, size_mm: got {coarser.values['size_mm']:g} twice for {name} "
+                f"{path}: line {coarser.line}, {size}: got {coarser.values[size] * to_mm:g} mm twice for {name} "
                 f"(also in line {finer.line}); must differ from sieve to sieve; remove one"
             )
-    for column in ("feed", "centre", "edge", "total"):
+    for column in columns:
         measured = [row for row in rows if not math.isnan(row.values[column])]
         for finer, coarser in itertools.pairwise(measured):
             if coarser.values[column] < finer.values[column]:
                 yield (
                     f"{path}: line {coarser.line}, {column}: got {coarser.values[column]:g} % at "
-                    f"{coarser.values['size_mm']:g} mm in {name}; must not be below the "
+                    f"{coarser.values[size] * to_mm:g} mm in {name}; must not be below the "
                     f"{finer.values[column]:g} % of the finer sieve in line {finer.line}; correct one of them"
                 )
-        if measured and measured[-1] is rows[-1] and rows[-1].values[column] != 100:
+        if measured and measured[-1] is rows[-1] and not 100 - _MOST_RETAINED <= rows[-1].values[column] <= 100:
             yield (
                 f"{path}: line {rows[-1].line}, {column}: got {rows[-1].values[column]:g} at the coarsest sieve of "
-                f"{name}; must be 100, in percent; add the next coarser sieve, which all of it passes"
+                f"{name}; must be {100 - _MOST_RETAINED:g} to 100, in percent; add the next coarser sieve"
             )
 
 
-def _pilot_test(name: str, run: _Row, sieves: list[_Row]) -> PilotTest:
+def _pilot_test(name: str, run: _Row, sieves: list[_Row], path: str | Path) -> PilotTest:
     sieves = sorted(sieves, key=lambda row: row.values["size_mm"])
+    if sieves[-1].values["feed"] < 100:
+        top = {"size_mm": _next_sieve(path, sieves, "size_mm", 1.0), "feed": 100.0}
+        sieves.append(_Row(sieves[-1].line, name, dict.fromkeys(_PRODUCT, math.nan) | top))
     measured = {column.field: run.values[key] * column.factor for key, column in _OPERATIONS.items()}
     for key, column in _PRODUCT.items():
         array = np.array([row.values[key] for row in sieves]) * column.factor

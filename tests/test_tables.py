@@ -14,38 +14,30 @@ def write(path, text):
 
 
 @pytest.mark.parametrize(
-    ("header", "metres"),
+    ("text", "table"),
     [
-        ("size_mm", 1e-3),
-        ("size [mm]", 1e-3),
-        ("Size (mm)", 1e-3),
-        ("aperture [µm]", 1e-6),
-        ("sieve_size_m", 1.0),
-        ("size_inch", 0.0254),
+        ("size_mm,percent_passing\n1,10\n2,100\n", [(1e-3, 10), (2e-3, 100)]),
+        ("Size (mm),wet,passing %\n4,,100 %\n1,3,10%\n2,3,50\n", [(1e-3, 10), (2e-3, 50), (4e-3, 100)]),
+        ("sieve_size_m\tcum. finer\n0.001\t0.1\n0.002\t1\n", [(1e-3, 10), (2e-3, 100)]),
+        ("aperture [µm];passing\n500,5;12,5\n1000;100\n", [(500.5e-6, 12.5), (1e-3, 100)]),
+        ("\ufeff# a comment\n\nsize_inch,passing\n  # another\n1 1/2,100\n0.5,10\n\n", [(12.7e-3, 10), (38.1e-3, 100)]),
+        ("mesh,passing\n10,100\n#200,12\n", [(75e-6, 12), (2e-3, 100)]),
+        ('sieve,passing\n"3/4""",100\n#4,50\n45 um,3\n', [(45e-6, 3), (4.75e-3, 50), (19.05e-3, 100)]),
+        ("size_mm,retained_pct,moisture_pct\n8,0,4\n4,30,4\n2,20,4\npan,50,4\n", [(2e-3, 50), (4e-3, 70), (8e-3, 100)]),
+        ("size_mm;cumulative retained\n4;0,3\n8;0\n", [(4e-3, 70), (8e-3, 100)]),
     ],
 )
-def test_unit_is_read_from_the_header(tmp_path, header, metres):
-    path = write(tmp_path / "t.csv", f"{header},percent_passing\n1,10\n2,100\n")
-    table = tables.read_sieve_table(path)
-    assert table == [(pytest.approx(metres), 10.0), (pytest.approx(2 * metres), 100.0)]
+def test_tables_of_laboratories_are_read(tmp_path, text, table):
+    found = tables.read_sieve_table(write(tmp_path / "t.csv", text))
+    assert [row for pair in found for row in pair] == pytest.approx([row for pair in table for row in pair])
 
 
-def test_rows_come_out_finest_first_whatever_their_order(tmp_path):
-    rising = write(tmp_path / "a.csv", "size_mm,percent_passing\n1,10\n2,50\n4,100\n")
-    falling = write(tmp_path / "b.csv", "size_mm,percent_passing\n4,100\n2,50\n1,10\n")
-    assert tables.read_sieve_table(rising) == tables.read_sieve_table(falling)
-
-
-def test_comments_blank_lines_and_byte_order_mark_are_skipped(tmp_path):
-    path = write(tmp_path / "t.csv", "\ufeff# a comment\n\nsize_mm,percent_passing\n  # another\n1,10\n\n2,100\n")
-    assert len(tables.read_sieve_table(path)) == 2
-
-
-def test_shuffled_rows_are_left_for_the_feed_to_refuse(tmp_path):
-    path = write(tmp_path / "t.csv", "size_mm,percent_passing\n1,10\n4,100\n2,50\n")
-    assert [percent for _, percent in tables.read_sieve_table(path)] == [10, 100, 50]
-    with pytest.raises(ValueError, match=r"row 3 \(2 mm, 50 %\)"):
-        TableFeed(table=path)
+def test_next_sieve_is_added_above_up_to_5_percent_and_said(tmp_path):
+    path = write(tmp_path / "t.csv", "size_mm,passing\n31.5,96.32\n22.4,57.6\n16,40\n")
+    with pytest.warns(UserWarning, match=r"t\.csv: line 2: .* the next of the series, 45 mm, is added"):
+        assert tables.read_sieve_table(path)[-2:] == [(pytest.approx(0.0315), 96.32), (pytest.approx(0.045), 100.0)]
+    with pytest.raises(ValueError, match=r"t\.csv: line 2, passing: got 94.9 .*; must be 95 to 100"):
+        tables.read_sieve_table(write(path, "size_mm,passing\n31.5,94.9\n22.4,57.6\n"))
 
 
 @pytest.mark.parametrize(
@@ -53,22 +45,26 @@ def test_shuffled_rows_are_left_for_the_feed_to_refuse(tmp_path):
     [
         ("", "empty"),
         ("# only a comment\n", "empty"),
-        ("size,percent_passing\n1,2\n", "name the unit"),
-        ("1,2\n3,4\n", "name the unit"),
-        ("size_mm,percent\n1,2\n", "percent_passing"),
-        ("size_mm,percent_passing,n\n1,2,3\n", "name the unit"),
-        ("size_kg,percent_passing\n1,2\n", "use a length"),
-        ("size_foo,percent_passing\n1,2\n", "use a length"),
-        ("size_mm,percent_passing\n1,10\nx,100\n", r"line 3 'x,100' is not two numbers"),
-        ("size_mm,percent_passing\n1,10\n2\n", r"line 3 '2' is not two numbers"),
-        ("size_mm,percent_passing\n1,10,3\n", r"line 2 '1,10,3' is not two numbers"),
+        ("size,percent_passing\n1,2\n", "line 2 '1,2': name the unit of the sizes"),
+        ("1,2\n3,4\n", "line 1, header '1,2': it names no column of sizes"),
+        ("size_mm,percent\n1,2\n", "it names no percent passing or retained"),
+        ("size_kg,percent_passing\n1,2\n", "'kg' measures something else; give the sizes in a length"),
+        ("size_foo,percent_passing\n1,2\n", "'foo' is not known"),
+        ("size_mm,percent_passing\n1,10\nx,100\n", "line 3 'x,100': its size must be a number, a fraction"),
+        ("size_mm,percent_passing\n1,10\n2,\n", "line 3 '2,': must be a number"),
+        ("size_mm,percent_passing\n1,10\n31,5,97,6\n", "line 3 .*: got 4 cells, the header has 2; write decimals"),
+        ("mesh,passing\n10,100\n11,50\n", "line 3 '11,50': its size must be a mesh number of ASTM E11"),
+        ("size_mm,passing\n1,10\n2,60\n1,100\n", "line 4, size: got 1 mm twice .*also in line 2"),
+        ("size_mm,passing\n1,10\n4,100\n2,5\n", "line 4, passing: got 5 % at 2 mm .* finer sieve in line 2"),
+        ("size_mm,passing\n1,100\n", "line 2, test: got 1 sieve"),
     ],
 )
-def test_unreadable_tables_are_refused_naming_file_and_row(tmp_path, text, words):
+def test_unreadable_tables_are_refused_with_line_and_format(tmp_path, text, words):
     path = write(tmp_path / "t.csv", text)
     with pytest.raises(ValueError, match=words) as error:
         tables.read_sieve_table(path)
     assert str(path) in str(error.value)
+    assert "size_mm,percent_passing" in str(error.value) or "empty" in words
 
 
 def test_missing_file_is_an_os_error_and_the_feeds_fault(tmp_path):
@@ -151,6 +147,21 @@ def test_tests_stand_in_the_order_of_the_operations(tmp_path):
     assert [(test.name, test.surface_speed) for test in tests] == [("B", 0.5), ("A", 1.0)]
 
 
+def test_next_sieve_of_a_test_has_all_of_the_feed_and_no_product(tmp_path):
+    with pytest.warns(UserWarning, match=r"p\.csv: line 2: .* 8 mm, is added"):
+        [test] = read_tests(tmp_path, PRODUCT.replace("A,4,100", "A,4,96.32"))
+    assert test.sizes == pytest.approx([1e-3, 2e-3, 4e-3, 8e-3])
+    assert test.feed[-2:] == pytest.approx([0.9632, 1.0])
+    assert test.total == pytest.approx([0.35, 0.7, 1.0, math.nan], nan_ok=True)
+
+
+def test_pilot_tables_may_have_semicolons_and_decimal_commas(tmp_path):
+    [plain] = read_tests(tmp_path)
+    text = OPERATIONS.replace(",", ";").replace(".", ",")
+    [other] = read_tests(tmp_path, PRODUCT.replace(",", ";"), text)
+    assert plain[1:3] == other[1:3]
+
+
 def test_arrays_of_a_test_are_read_only(tmp_path):
     [test] = read_tests(tmp_path)
     with pytest.raises(ValueError, match="read-only"):
@@ -164,9 +175,9 @@ def test_arrays_of_a_test_are_read_only(tmp_path):
         ("A,2,50", "A,2,101", "p.csv: line 4, feed: got '101'; must be at least 0 and at most 100"),
         ("A,1,10", "A,1,55", "p.csv: line 4, feed: got 50 % at 2 mm in A; must not be below the 55 %"),
         (",60,70", ",10,70", "p.csv: line 4, edge: got 10 %"),
-        ("A,4,100", "A,4,99.9", "p.csv: line 2, feed: got 99.9 at the coarsest sieve of A; must be 100"),
-        ("A,4,100,100,100,100", "A,4,100,100,100,97", "p.csv: line 2, total: got 97 at the coarsest sieve"),
-        ("A,2,", "A,1,", "p.csv: line 4, size_mm: got 1 twice for A (also in line 3)"),
+        ("A,4,100", "A,4,94", "p.csv: line 2, feed: got 94 at the coarsest sieve of A; must be 95 to 100"),
+        ("A,4,100,100,100,100", "A,4,100,100,100,94", "p.csv: line 2, total: got 94 at the coarsest sieve"),
+        ("A,2,", "A,1,", "p.csv: line 4, size_mm: got 1 mm twice for A (also in line 3)"),
         ("A,2,", "A,0,", "p.csv: line 4, size_mm: got '0'; must be above 0"),
         ("A,2,", "A,,", "p.csv: line 4, size_mm: got an empty cell; must be a number"),
         ("A,2,", ",2,", "p.csv: line 4, test: got an empty cell"),
@@ -221,7 +232,7 @@ def test_faults_of_both_files_come_at_once_and_only_once(tmp_path):
 
 def test_a_single_sieve_is_no_distribution(tmp_path):
     [fault] = refused(tmp_path, "test,size_mm,feed,total\nA,4,100,100\n")
-    assert "line 2, test: got one sieve for A; must be at least two" in fault
+    assert "line 2, test: got 1 sieve for A; must be at least two" in fault
 
 
 def test_missing_pilot_table_is_an_os_error(tmp_path):
@@ -237,7 +248,7 @@ def test_missing_pilot_table_is_an_os_error(tmp_path):
         (b"1" * 11_000_000, "got more than 10,000,000 bytes; a table must be smaller"),
         (b"1" * 200_000, "got 1 lines; a table has at most 10,000 lines of 10,000 characters"),
         (b"1,2\n" * 10_001, "got 10,001 lines; a table has"),
-        (b"size_mm,percent_passing\n1,2\n" + b"x" * 9000, r"line 3 'x{57}\.\.\.' is not two numbers"),
+        (b"size_mm,percent_passing\n1,2\n" + b"x" * 9000, r"line 3 'x{57}\.\.\.': got 1 cells"),
         (b"test,feed" + b",q" * 1000 + b"\n", "."),
     ],
     ids=["latin", "binary", "huge", "one line", "many lines", "long cell", "many columns"],

@@ -16,6 +16,8 @@ from pydantic_core import PydanticCustomError
 from hpgr import tables
 from hpgr.fields import Fault, Frozen, Metres, Number, quantity, show
 
+_FINEST = math.log(1e-9)  # m, at or above which the slope of a table's fine end must reach zero
+
 
 class _Distribution(Frozen):
     @property
@@ -186,12 +188,18 @@ class TableFeed(_Distribution):
         return float(np.interp(np.log(self.top_size), *self._logs()))
 
     def _logs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return log size and passing fraction, the lowest segment extended to zero passing."""
+        """Return log size and passing fraction, the lowest segment extended to zero passing.
+
+        A fine end so flat that this would be under 1 nm says nothing of what is below it, which then spans a decade.
+        """
         size, percent = np.array(self.table).T
         log_size, fraction = np.log(size), percent / 100
         if fraction[0] > 0:
-            slope = (fraction[1] - fraction[0]) / (log_size[1] - log_size[0])
-            log_size = np.concatenate([[log_size[0] - fraction[0] / slope], log_size])
+            with np.errstate(divide="ignore"):
+                slope = (fraction[1] - fraction[0]) / (log_size[1] - log_size[0])
+                lowest = log_size[0] - fraction[0] / slope
+            lowest = lowest if lowest >= _FINEST else log_size[0] - math.log(10)
+            log_size = np.concatenate([[lowest], log_size])
             fraction = np.concatenate([[0.0], fraction])
         return log_size, fraction
 
@@ -225,22 +233,10 @@ def _table_faults(table: tuple[tuple[float, float], ...], top_size: float | None
     if table[-1][1] != 100:
         got = f"row {len(table)} ({table[-1][1]:g} %)"
         yield Fault("table", got, "the coarsest sieve must pass 100 %", "add the sieve that everything passes")
-    if not _ends_below(*table[:2]):
-        bound = "its slope extended below it reaches 0 % only under 1 nm"
-        yield Fault("table", rows[0], bound, "add a finer row with 0 % passing")
     empty = max((size for size, percent in table if percent <= 0), default=table[0][0])
     if top_size is not None and not empty < top_size <= table[-1][0]:
         bound = f"must lie within the table, above {show(empty, 'm')} to {show(table[-1][0], 'm')}"
         yield Fault("top_size", show(top_size, "m"), bound, "scalping only removes coarse grains")
-
-
-def _ends_below(first: tuple[float, float], second: tuple[float, float]) -> bool:
-    """Return whether the lowest segment, extended, reaches zero passing at a size of at least 1 nm."""
-    (size, percent), (next_size, next_percent) = first, second
-    if percent <= 0 or not 0 < size < next_size:
-        return True
-    slope = (next_percent - percent) / math.log(next_size / size)
-    return slope > 0 and size * math.exp(-min(percent / slope, 700.0)) >= 1e-9
 
 
 Feed = Annotated[UniformFeed | SingleFeed | PowerLawFeed | RosinRammlerFeed | TableFeed, Field(discriminator="kind")]
