@@ -1,22 +1,21 @@
-"""Cases recorded whole and opened together; files that would have the library read elsewhere."""
+"""Cases recorded whole and opened together."""
 
+import contextlib
+import json
 import sys
 import threading
 import time
 
 import dask
 import numpy as np
-import psutil
 import pytest
 import xarray as xr
 from support import paper, sized
 
 import hpgr
 import studies
-from hpgr import pipeline
-from studies import runner, store
-from studies.bench import STATUS
-from studies.sweep import sweep
+from hpgr.results.schema import STATUS
+from studies.sweep import assemble, netcdf, run, sweep
 
 SMALL = {"resolution.streamlines": 2, "resolution.points": 12, "resolution.cells": 16}
 AXES = {"rolls.gap": [0.04, 0.05, 1.2, 0.06], "rolls.speed": [2.0, 3.0]}  # a gap of 1.2 m is refused
@@ -25,12 +24,6 @@ AXES = {"rolls.gap": [0.04, 0.05, 1.2, 0.06], "rolls.speed": [2.0, 3.0]}  # a ga
 @pytest.fixture(scope="module")
 def base():
     return paper(SMALL)
-
-
-@pytest.fixture(scope="module")
-def client():
-    with runner.own_client(1) as own:
-        yield own
 
 
 @pytest.fixture(scope="module", params=["distributions", "cells"])
@@ -68,10 +61,10 @@ def test_every_case_is_what_simulate_gives(base, folder, record):
 
 def test_nothing_is_read_before_it_is_needed_and_a_chunk_is_a_case(folder, monkeypatch):
     read = []
-    real = store.read_variable
-    monkeypatch.setattr(store, "read_variable", lambda path, name, **k: read.append(name) or real(path, name, **k))
+    real = netcdf.read_variable
+    monkeypatch.setattr(netcdf, "read_variable", lambda path, name, **k: read.append(name) or real(path, name, **k))
     cases = studies.open_cases(folder)
-    assert set(read) <= {"xi", "sieve", "photograph"}  # what the time is called in files
+    assert set(read) <= {"xi", "sieve", "snapshot"}  # what the time is called in files
     read.clear()
     for name, variable in cases.data_vars.items():
         if name != "status":
@@ -91,7 +84,7 @@ def test_reductions_over_two_threads(folder, record):
 
     def read_beside():
         while not stop.is_set():
-            with store.open_result(some) as opened:
+            with netcdf.open_result(some) as opened:
                 opened["pressure"].values  # noqa: B018
 
     beside = threading.Thread(target=read_beside)
@@ -126,23 +119,35 @@ def test_variables_of_uneven_shape_are_left_out_and_named(base, client, tmp_path
     assert cases["p80_total"].notnull().all()
 
 
-def test_cases_need_a_folder(base):
-    with pytest.raises(ValueError, match="folder: got None; record='cells'"):
-        sweep(base, {}, record="cells")
-
-
 def test_folder_without_cases_is_refused(base, client, tmp_path):
     with pytest.raises(ValueError, match="holds no cases recorded whole"):
         studies.open_cases(tmp_path)
     sweep(base, {}, client=client, folder=tmp_path)
     with pytest.raises(ValueError, match="holds no cases recorded whole"):
         studies.open_cases(tmp_path)
-    (tmp_path / "sweep.json").write_text("{")
-    with pytest.raises(ValueError, match="damaged"):
-        studies.open_cases(tmp_path)
-    (tmp_path / "sweep.json").write_text('{"format": 99}')
-    with pytest.raises(ValueError, match="format 99"):
-        studies.open_cases(tmp_path)
+
+
+def test_manifest_that_is_damaged_or_somebody_elses_is_refused(base, client, tmp_path):
+    sweep(base, {"rolls.gap": [0.04]}, client=client, folder=tmp_path, record="distributions")
+    good = (tmp_path / "sweep.json").read_text()
+    told = json.loads(good)
+
+    def forged(**values):
+        sweep = told["sweep"] | values
+        return json.dumps({"format": 2, "checksum": assemble._checksum(sweep), "sweep": sweep})
+
+    outside = forged(addresses=["../" * 10 + "etc/passwd"])
+    for text in ("{", "[" * 200_000, '{"format": 99}', "3", outside, forged(addresses=[3]), forged(addresses=3)):
+        (tmp_path / "sweep.json").write_text(text)
+        with pytest.raises(ValueError, match=r"damaged .*run the sweep again"):
+            studies.open_cases(tmp_path)
+    silent = []
+    for place in range(0, len(good), 7):
+        broken = good[:place] + chr(ord(good[place]) ^ 1) + good[place + 1 :]
+        (tmp_path / "sweep.json").write_text(broken)
+        with contextlib.suppress(ValueError):
+            silent += [] if assemble._manifest(tmp_path / "sweep.json") == told["sweep"] else [place]
+    assert not silent
 
 
 def test_file_of_another_case_is_refused(base, client, tmp_path):
@@ -156,91 +161,23 @@ def test_file_of_another_case_is_refused(base, client, tmp_path):
 def test_cases_in_flight_are_few(base, client, tmp_path, monkeypatch):
     """The driver is handed whole cases no faster than it writes them."""
     running, most = set(), [0]
-    real_crush = pipeline.crush
+    real = run.run_scene
 
-    def crush(scene, prepared, seed, replicate):
+    def run_scene(scene, seed, replicate, beds):
         running.add((scene.rolls.gap, replicate))
         most[0] = max(most[0], len(running))
-        return real_crush(scene, prepared, seed, replicate)
+        return real(scene, seed, replicate, beds)
 
-    def write_case(outcome, address, path):
+    def write(dataset, path):
         time.sleep(0.02)
-        running.discard((hpgr.Scene.model_validate_json(outcome.attrs["scene"]).rolls.gap, outcome.attrs["replicate"]))
+        running.discard((json.loads(dataset.attrs["scene"])["rolls"]["gap"], dataset.attrs["replicate"]))
+        path.write_bytes(b"x")
 
-    monkeypatch.setattr(pipeline, "crush", crush)
-    monkeypatch.setattr("studies.recorded.write_case", lambda *a: (write_case(*a), a[2].write_bytes(b"x")))
+    monkeypatch.setattr(run, "run_scene", run_scene)
+    monkeypatch.setattr(netcdf, "write_dataset", write)
     sweep(base, {"rolls.gap": [0.04, 0.05, 0.06]}, 10, client=client, folder=tmp_path, record="cells")
     assert not running
     assert most[0] <= 4  # 2 for the one thread, one being written, one just begun
-
-
-# ---- trust
-
-
-def plain(path):
-    store.write_dataset(xr.Dataset({"a": (("x",), np.arange(4.0, dtype=np.float32))}), path)
-    return path
-
-
-def test_own_files_are_opened(tmp_path):
-    with store.open_result(plain(tmp_path / "a.nc")) as opened:
-        assert opened["a"].values.tolist() == [0, 1, 2, 3]
-    assert store.read_variable(tmp_path / "a.nc", "a").tolist() == [0, 1, 2, 3]
-
-
-def external_dataset(file, secret):
-    file.create_dataset("b", (4,), "u1", external=[(str(secret), 0, 4)])
-
-
-def external_link(file, secret):
-    import h5py
-
-    file["b"] = h5py.ExternalLink(str(secret.with_name("other.nc")), "/a")
-
-
-def soft_link(file, secret):
-    import h5py
-
-    file["b"] = h5py.SoftLink("/a")
-
-
-def virtual_dataset(file, secret):
-    import h5py
-
-    layout = h5py.VirtualLayout((4,), "f4")
-    layout[:] = h5py.VirtualSource(str(secret.with_name("other.nc")), "a", (4,))
-    file.create_virtual_dataset("b", layout)
-
-
-def user_filter(file, secret):
-    file.create_dataset("b", (4,), "f4", chunks=(4,), compression="lzf")  # which the NetCDF library does not have
-
-
-def below(make):
-    def nested(file, secret):
-        make(file.create_group("deep/deeper"), secret)
-
-    nested.__name__ = f"nested {make.__name__}"
-    return nested
-
-
-KINDS = [external_dataset, external_link, soft_link, virtual_dataset, user_filter, below(external_dataset)]
-
-
-@pytest.mark.parametrize("make", KINDS, ids=lambda make: make.__name__)
-def test_files_that_reach_elsewhere_are_refused_unread(tmp_path, make, monkeypatch):
-    import h5py
-
-    secret = tmp_path / "secret"
-    secret.write_bytes(b"key!")
-    plain(tmp_path / "other.nc")
-    path = plain(tmp_path / "a.nc")
-    with h5py.File(path, "r+") as file:
-        make(file, secret)
-    monkeypatch.setattr(xr, "open_dataset", None)  # calling it would raise a TypeError
-    for read in (store.open_result, lambda path: store.read_variable(path, "a"), store.shapes_in):
-        with pytest.raises(ValueError, match="refused unread"):
-            read(path)
 
 
 def test_cases_that_reach_elsewhere_are_refused(base, client, tmp_path):
@@ -250,17 +187,9 @@ def test_cases_that_reach_elsewhere_are_refused(base, client, tmp_path):
     [path] = tmp_path.glob("*.nc")
     (tmp_path / "secret").write_bytes(b"key!")
     with h5py.File(path, "r+") as file:
-        external_dataset(file, tmp_path / "secret")
+        file.create_dataset("b", (4,), "u1", external=[(str(tmp_path / "secret"), 0, 4)])
     with pytest.raises(ValueError, match="/b has its values in other files"):
         studies.open_cases(tmp_path)
-
-
-def test_what_is_no_netcdf_is_refused(tmp_path):
-    (tmp_path / "a.nc").write_bytes(b"\x80\x04\x95pickle")
-    with pytest.raises(ValueError, match="cannot be read as NetCDF"):
-        store.open_result(tmp_path / "a.nc")
-    with pytest.raises(OSError, match="No such file"):
-        store.open_result("http://127.0.0.1:9/a.nc")
 
 
 def test_nothing_is_unpickled_from_disk(base, client, tmp_path, monkeypatch):
@@ -276,22 +205,20 @@ def test_nothing_is_unpickled_from_disk(base, client, tmp_path, monkeypatch):
         monkeypatch.setattr(owner, name, refuse)
     sweep(base, {"rolls.gap": [0.04]}, client=client, folder=tmp_path, record="distributions")
     assert studies.open_cases(tmp_path).sizes["gap"] == 1
-    for module in ("cases", "recorded", "store", "isolated"):
-        assert "pickle" not in vars(sys.modules[f"studies.{module}"])
+    for module in ("cases", "assemble", "netcdf", "isolated"):
+        assert "pickle" not in vars(sys.modules[f"studies.sweep.{module}"])
 
 
-@pytest.mark.parametrize("timeout", [None, 60.0])
-def test_nothing_listens_beyond_loopback(base, monkeypatch, timeout, tmp_path):
-    seen = []
-    real = runner.outcomes
+def test_manifest_is_whole_or_not_at_all(base, client, tmp_path, monkeypatch):
+    options = {"client": client, "folder": tmp_path, "record": "distributions"}
+    sweep(base, {"rolls.gap": [0.04]}, **options)
+    before = (tmp_path / "sweep.json").read_bytes()
 
-    def outcomes(*arguments):
-        for outcome in real(*arguments):
-            for process in (psutil.Process(), *psutil.Process().children(recursive=True)):
-                seen.extend(one for one in process.net_connections("inet") if one.status == psutil.CONN_LISTEN)
-            yield outcome
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(runner, "outcomes", outcomes)
-    sweep(base, {"rolls.gap": [0.04]}, folder=tmp_path, timeout=timeout)
-    assert seen  # the dashboards, or the test looks at nothing
-    assert {one.laddr.ip for one in seen} <= {"127.0.0.1", "::1"}
+    with monkeypatch.context() as patch:
+        patch.setattr(netcdf, "replace", full)
+        with pytest.raises(OSError, match="No space"):
+            sweep(base, {"rolls.gap": [0.04]}, **options)
+    assert (tmp_path / "sweep.json").read_bytes() == before
