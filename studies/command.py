@@ -1,6 +1,9 @@
 """What all command lines share: options, base scene, history, writing, refusing, exit codes, progress."""
 
+import contextlib
+import dataclasses
 import functools
+import itertools
 import re
 import shlex
 import sys
@@ -13,7 +16,8 @@ from pydantic import ValidationError
 
 from hpgr import presets
 from hpgr.fields import check_seed, faults_of, parse
-from hpgr.scene import Scene, levels
+from hpgr.scene import Scene, field_info, levels
+from studies.sweep.space import ends_of, field_of
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -39,6 +43,14 @@ _LEVELS = tuple(levels())
 
 SceneName = Annotated[
     str, shown_as("PRESET|FILE", f"Base scene: a preset ({', '.join(presets.NAMES)}), or a .toml or .json scene file.")
+]
+SceneNames = Annotated[
+    tuple[str, ...],
+    shown_as("PRESET|FILE ...", f"Scene, or scenes to compare: presets ({', '.join(presets.NAMES)}), .toml or .json."),
+]
+Vary = Annotated[
+    tyro.conf.UseAppendAction[tuple[str, ...]],
+    shown_as("FIELD=V1,V2,...", "Values of any scene field, or lo..hi:N, such as 'gap=40 mm..60 mm:5'; repeatable."),
 ]
 Level = Annotated[
     Literal[_LEVELS] | None,
@@ -112,6 +124,50 @@ def quantity_of(option: str, text: str, unit: str) -> float:
         raise ValueError(f"{option}: got {text!r}; {error}") from None
 
 
+def scenes_of(options: Any) -> dict[str, Scene]:
+    """Return the scenes of options that have several names as `scene`, each as `base_scene` makes it."""
+    found = {Path(name).stem: base_scene(dataclasses.replace(options, scene=name)) for name in options.scene}
+    if not options.scene or len(found) < len(options.scene):
+        raise ValueError(f"--scene: got {' '.join(options.scene) or 'none'}; must be scenes of different names")
+    return found
+
+
+def varied(text: str) -> tuple[str, list | tuple]:
+    """Return the field that a `--vary` names and its values, or the ends (low, high) of a range to draw from.
+
+    Examples
+    --------
+    >>> from studies.command import varied
+    >>> varied("gap=40 mm..60 mm:3")
+    ('rolls.gap', [0.04, 0.05, 0.06])
+    """
+    name, equals, values = text.partition("=")
+    if not equals:
+        raise ValueError(f"--vary: got {text!r}; must be a field and its values; such as 'gap=40 mm,60 mm'")
+    field = field_of(name.strip())
+    low, dots, rest = values.partition("..")
+    if not dots:
+        return field, [_number(field, value) for value in values.split(",")]
+    high, colon, count = rest.partition(":")
+    [(low, high)] = ends_of({field: (_number(field, low), _number(field, high))}).values()
+    if not colon:
+        return field, (low, high)
+    if not count.strip().isdecimal() or not 2 <= int(count) <= 10_000:
+        raise ValueError(f"--vary: got {text!r}; must end with the number of values, 2 to 10,000; such as 'lo..hi:5'")
+    last = int(count) - 1
+    values = [float(f"{low + k * (high - low) / last:.12g}") for k in range(last + 1)]
+    return field, [round(value) for value in values] if isinstance(low, int) and isinstance(high, int) else values
+
+
+def _number(field: str, text: str) -> Any:
+    """Return the text of a value as the number it is, where the field has no unit."""
+    if field_info(field).unit == "1":
+        for kind in (int, float):
+            with contextlib.suppress(ValueError):
+                return kind(text)
+    return text.strip()
+
+
 # ---- one main
 
 
@@ -136,7 +192,7 @@ class Report(NamedTuple):
 
 def file_of(out: Path, suffix: str = ".nc") -> Path:
     """Return the path that `--out` asks for, with its suffix."""
-    if not out.name:
+    if out.name in ("", ".."):
         raise ValueError(f"--out: got {str(out)!r}; must be the name of a file; such as --out outputs/mine{suffix}")
     return out if out.suffix == suffix else out.with_name(out.name + suffix)
 
@@ -281,9 +337,10 @@ def _maker(path: Path) -> str | None:
 
 
 def _named(line: str) -> tuple[str, str]:
-    """Return the study and the scene that a command line names."""
+    """Return the study and the scenes that a command line names."""
     words = shlex.split(line.replace(" --scene=", " --scene "))
-    return words[2], words[words.index("--scene") + 1] if "--scene" in words[:-1] else ""
+    scenes = words[words.index("--scene") + 1 :] if "--scene" in words else []
+    return words[2], " ".join(itertools.takewhile(lambda word: not word.startswith("-"), scenes))
 
 
 # ---- progress

@@ -8,7 +8,7 @@ import hpgr
 from hpgr.results import schema
 from hpgr.results.schema import STATUS
 from studies.sweep import run, sweep
-from studies.sweep.space import AXES, Space, dim_of
+from studies.sweep.space import AXES, Space, axes_of, dim_of
 
 SMALL = {"resolution.streamlines": 3, "resolution.points": 40, "resolution.cells": 60}
 GAPS = ["40 mm", "50 mm", "60 mm"]
@@ -55,7 +55,7 @@ def test_labelled_grid(grid, base):
 
 
 def test_every_place_holds_its_own_case(grid, base):
-    space = Space({AXES[dim]: grid[dim].values.tolist() for dim in ("roll_speed", "feed_top_size", "gap")}, 2)
+    space = Space(axes_of({dim: grid[dim] for dim in ("roll_speed", "feed_top_size", "gap")}), 2)
     for case in space.cases():
         values = case.values | {"resolution.record": "product"}
         alone = hpgr.simulate(base.with_values(values), seed=3, replicate=case.replicate)
@@ -64,7 +64,7 @@ def test_every_place_holds_its_own_case(grid, base):
 
 
 def test_cases_are_numbered_in_the_order_of_the_axes():
-    space = Space({"rolls.gap": [1.0, 2.0], "rolls.speed": [3.0, 4.0, 5.0]}, 2)
+    space = Space(axes_of({"rolls.gap": [1.0, 2.0], "rolls.speed": [3.0, 4.0, 5.0]}), 2)
     assert [case.index for case in space.cases()] == list(np.ndindex(2, 3, 2))
     assert [space.number(case.index) for case in space.cases()] == list(range(space.total))
     assert space.case(9) == ((1, 1, 1), {"rolls.gap": 2.0, "rolls.speed": 4.0}, 1)

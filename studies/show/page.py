@@ -77,7 +77,7 @@ def page_data(result: xr.Dataset, sieve: float, name: str) -> dict[str, Any]:
         "told": [line[0].upper() + line[1:] for line in told(result)],
         "made": {key: str(result.attrs[key]) for key in _MADE if key in result.attrs},
         "replicates": result.sizes["replicate"],
-        "axes": [axis_data(result[axis], scene) for axis in axes],
+        "axes": [axis_data(result, axis, scene) for axis in axes],
         "start": start(result, scene, held),
         "held": held.tolist(),
         "said": [said(points.isel(operating_point=k)) for k in range(points.sizes["operating_point"])],
@@ -235,10 +235,9 @@ def with_sieve(result: xr.Dataset, sieve: float, largest: float) -> xr.Dataset:
     )
 
 
-def axis_data(axis: xr.DataArray, scene: Scene) -> dict[str, Any]:
-    """Return a swept axis: labels, values, the order of its slider, and what each value changes in the scene."""
-    field, unit = axis.attrs["scene_field"], axis.attrs["units"]
-    raw = axis.values.tolist()
+def axis_data(result: xr.Dataset, dim: str, scene: Scene) -> dict[str, Any]:
+    """Return a swept axis: labels, values, the order of its slider, and what each place changes in the scene."""
+    axis, places = result[dim], report.places(result, dim)
     numeric = axis.dtype.kind in "fiu"
     values = report.shown_values(axis)
     return {
@@ -246,12 +245,11 @@ def axis_data(axis: xr.DataArray, scene: Scene) -> dict[str, Any]:
         "words": axis.name.replace("_", " "),
         "label": report.axis_label(axis),
         "about": axis.attrs.get("long_name", ""),
-        "field": field,
         "values": numbers(values) if numeric and np.isfinite(values).all() else None,
-        "texts": [show(value, unit) if numeric else str(value) for value in raw],
+        "texts": [report.place_text(result, dim, k) for k in range(axis.size)],
         "order": np.argsort(values, kind="stable").tolist() if numeric else list(range(axis.size)),
-        "raw": [_plain(value) for value in raw],
-        "changes": [changes(scene, field, value) for value in raw],
+        "raw": [{name: _plain(value) for name, value in place.items() if "." in name} for place in places],
+        "changes": [changes(scene, place) for place in places],
     }
 
 
@@ -260,18 +258,22 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def changes(scene: Scene, field: str, value: Any) -> dict[str, Any]:
-    """Return the fields, by dotted name, that a scene changes when one is given a value; None for one that it drops."""
+def changes(scene: Scene, values: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields, by dotted name, that a scene changes when given values; None for one, or part, it drops."""
     try:
-        other = scene.with_values({field: value})
+        other = scene.with_values(values)
     except ValidationError:  # a case that was refused
-        return {field: _plain(value)}
-    section = field.partition(".")[0]
-    before, after = (json.loads(one.model_dump_json())[section] or {} for one in (scene, other))
-    dropped = {key: None for key in before if key not in after}
-    return {
-        f"{section}.{key}": new for key, new in (after | dropped).items() if key not in before or before[key] != new
-    }
+        return {field: _plain(value) for field, value in values.items()}
+    found: dict[str, Any] = {}
+    every, now = (json.loads(one.model_dump_json()) for one in (scene, other))
+    for section in dict.fromkeys(name.partition(".")[0] for name in values):
+        before, after = every[section] or {}, now[section]
+        if after is None:
+            found |= {section: None} if before else {}
+            continue
+        after = after | {key: None for key in before if key not in after}
+        found |= {f"{section}.{key}": new for key, new in after.items() if key not in before or before[key] != new}
+    return found
 
 
 def start(result: xr.Dataset, scene: Scene, held: np.ndarray) -> list[int]:
@@ -279,7 +281,8 @@ def start(result: xr.Dataset, scene: Scene, held: np.ndarray) -> list[int]:
     shape = [result.sizes[name] for name in report.axes_of(result)]
     if not shape:
         return []
-    own = [_nearest(result[name], scene) for name in report.axes_of(result)]
+    axes = (result[name] for name in report.axes_of(result))
+    own = [_nearest(axis, scene) if report.is_field(axis) else 0 for axis in axes]
     full = np.argwhere(held.reshape(shape) > 0)
     return full[np.argmin(np.abs(full - own).sum(axis=1))].tolist()
 
@@ -298,15 +301,19 @@ def _nearest(axis: xr.DataArray, scene: Scene) -> int:
 def feeds_of(result: xr.Dataset, scene: Scene) -> tuple[list[Feed | None], list[int]]:
     """Return every feed of the sweep, None where a scene is refused, and the number of each operating point's feed."""
     axes = report.axes_of(result)
-    fields = {name: result[name].attrs["scene_field"] for name in axes}
-    swept = [name for name in axes if fields[name].startswith("feed.")]
+    fed = {name: [_of_feed(place) for place in report.places(result, name)] for name in axes}
+    swept = [name for name in axes if fed[name][0]]
     every = list(itertools.product(*(range(result.sizes[name]) for name in swept)))
     values = [
-        {fields[name]: result[name].values[k].item() for name, k in zip(swept, place, strict=True)} for place in every
+        dict(item for name, k in zip(swept, place, strict=True) for item in fed[name][k].items()) for place in every
     ]
     places = itertools.product(*(range(result.sizes[name]) for name in axes))
     chosen = [tuple(k for name, k in zip(axes, place, strict=True) if name in swept) for place in places]
     return [_feed(scene, each) for each in values], [every.index(place) for place in chosen]
+
+
+def _of_feed(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if name.partition(".")[0] == "feed"}
 
 
 def _feed(scene: Scene, values: dict[str, Any]) -> Feed | None:

@@ -1,6 +1,8 @@
 """What a study says in the terminal: tables, the limits that were hit, and the cases that were lost."""
 
+import json
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -9,6 +11,7 @@ from hpgr.fields import show, unit_shown
 from hpgr.results import flags, metrics
 from hpgr.results.schema import ERRORS, STATUS
 from studies.sweep.netcdf import scene_of
+from studies.sweep.space import SCENE
 
 PRODUCT = {  # variable -> heading, how many of its unit make one SI unit
     "throughput": ("throughput [t/h]", 3.6),
@@ -57,7 +60,37 @@ def aligned(headings: Sequence[str], rows: Iterable[Sequence[str]], markdown: bo
 
 def axes_of(result: xr.Dataset) -> list[str]:
     """Return the swept dims of a study result, in order."""
-    return [name for name, value in result.coords.items() if value.dims and "scene_field" in value.attrs]
+    return [name for name in result["status"].dims if name not in ("replicate", "operating_point")]
+
+
+def swept(result: xr.Dataset, dim: str) -> list[xr.DataArray]:
+    """Return what varies along a swept dim, that of its own name first: fields, and what its places are called."""
+    along = [value for value in result.coords.values() if value.dims == (dim,)]
+    return sorted(along, key=lambda value: value.name != dim)
+
+
+def places(result: xr.Dataset, dim: str) -> list[dict[str, Any]]:
+    """Return what each place along a swept dim changes in the scene: fields, or every section of a named scene."""
+    if dim == SCENE:
+        texts = json.loads(result.attrs["scenes"])
+        scenes = [scene_of(result.assign_attrs(scene=texts[name])) for name in result[SCENE].values.tolist()]
+        return [{name: part for name, part in scene if name not in ("remark", "resolution")} for scene in scenes]
+    fields = {axis.attrs["scene_field"]: axis.values.tolist() for axis in swept(result, dim) if is_field(axis)}
+    return [dict(zip(fields, row, strict=True)) for row in zip(*fields.values(), strict=True)]
+
+
+def is_field(axis: xr.DataArray) -> bool:
+    """Return whether a coordinate has the values of a scene field."""
+    return "scene_field" in axis.attrs
+
+
+def place_text(result: xr.Dataset, dim: str, index: int) -> str:
+    """Return a place along a swept dim in words: the value of each field, or what it is called."""
+    along = swept(result, dim)
+    if along[0].dtype.kind == "i" and len(along) > 1 and not is_field(along[0]):  # a mere number
+        along = along[1:]
+    told = value_text if len(along) == 1 else lambda axis, _: _place(axis, index)
+    return ", ".join(told(axis, axis.values[index]) for axis in along)
 
 
 def operating_points(result: xr.Dataset) -> xr.Dataset:
@@ -116,7 +149,8 @@ def table(result: xr.Dataset, sieve: float) -> str:
 
 
 def _points_table(result: xr.Dataset, points: xr.Dataset, found: dict[str, xr.DataArray]) -> str:
-    columns = {axis_label(points[name]): _axis_texts(points[name]) for name in axes_of(result)}
+    along = (axis.name for dim in axes_of(result) for axis in swept(result, dim))
+    columns = {axis_label(points[name]): _axis_texts(points[name]) for name in along}
     for heading, values in found.items():
         means, spreads = values.mean("replicate").values, spread(values).values
         columns[heading] = [_mean_and_spread(*each) for each in zip(means, spreads, strict=True)]
@@ -167,8 +201,9 @@ def change(result: xr.Dataset, field: str) -> list[str]:
 
     Replicates share their random numbers along an axis, so the change is that of pairs; other axes are averaged.
     """
-    axis = next(result[name] for name in axes_of(result) if result[name].attrs["scene_field"] == field)
-    if "p80_total" not in result or axis.size < 2 or axis.dtype.kind not in "fiu":
+    axes = (result[name] for name in axes_of(result) if result[name].attrs.get("scene_field") == field)
+    axis = next(axes, None)
+    if axis is None or "p80_total" not in result or axis.size < 2 or axis.dtype.kind not in "fiu":
         return []
     order = np.argsort(axis.values)
     p80 = result["p80_total"].astype(float).isel({axis.name: order})
@@ -193,7 +228,8 @@ def lost_cases(result: xr.Dataset) -> list[str]:
         lost[key] = lost.get(key, 0) + 1
     lines = []
     for (*index, status, message), count in lost.items():
-        place = [_place(result[name], k) for name, k in zip(axes, index, strict=True)]
+        along = [(axis, k) for name, k in zip(axes, index, strict=True) for axis in swept(result, name)]
+        place = [_place(axis, k) for axis, k in along]
         place.append(f"{count} of {result.sizes['replicate']} replicates")
         lines.append(f"{words[status]}: {', '.join(place)}: {message}")
     return lines
@@ -206,18 +242,18 @@ def any_result(result: xr.Dataset) -> bool:
 
 def axis_label(axis: xr.DataArray) -> str:
     """Return a swept coordinate's name with the unit it is shown in."""
-    name, unit = axis.name.replace("_", " "), axis.attrs["units"]
+    name, unit = axis.name.replace("_", " "), axis.attrs.get("units", "1")
     return name if unit == "1" else f"{name} [{unit_shown(unit)[0]}]"
 
 
 def shown_values(axis: xr.DataArray) -> np.ndarray:
     """Return a swept coordinate's values in the unit it is shown in."""
-    return axis.values * unit_shown(axis.attrs["units"])[1] if axis.dtype.kind in "fiu" else axis.values
+    return axis.values * unit_shown(axis.attrs.get("units", "1"))[1] if axis.dtype.kind in "fiu" else axis.values
 
 
 def value_text(axis: xr.DataArray, value) -> str:
     """Return a value of a swept coordinate as text with its unit."""
-    return show(float(value), axis.attrs["units"]) if axis.dtype.kind in "fiu" else str(value)
+    return show(float(value), axis.attrs.get("units", "1")) if axis.dtype.kind in "fiu" else str(value)
 
 
 def _place(axis: xr.DataArray, index: int) -> str:

@@ -1,4 +1,4 @@
-"""Axes x replicates -> cases -> dask futures -> one Dataset.
+"""Space x replicates -> cases -> dask futures -> one Dataset.
 
 A case is one scene with one replicate number. Finished cases are kept in a folder, if one is given, and read back
 instead of being computed again. Whatever a case does, only its own place in the result is left NaN, with its status
@@ -6,14 +6,14 @@ and message beside it. What is heavy loads late, for a command's `--help` does w
 """
 
 import numbers
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from hpgr.fields import check_seed
 from hpgr.scene import Scene
-from studies.sweep.space import Space, SweepSpec, axis_values
+from studies.sweep.space import Space, SweepSpec, axes_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -23,7 +23,7 @@ __all__ = ["sweep"]
 
 def sweep(
     scene: Scene,
-    axes: Mapping[str, Iterable],
+    space: "Mapping[Any, Any] | xr.Dataset",
     replicates: int = 1,
     seed: int = 0,
     client: Any = None,
@@ -36,21 +36,27 @@ def sweep(
     timeout: float | None = None,
     record: Literal["product", "distributions", "cells"] = "product",
 ) -> "xr.Dataset":
-    """Run `scene` at every combination of `axes`, and return the summaries as one Dataset.
+    """Run `scene` everywhere in `space`, and return the summaries as one Dataset.
 
     Parameters
     ----------
     scene : Scene
-        Base scene; what is recorded of it is `record`.
-    axes : mapping
-        Scene fields by dotted name, each with its values: SI numbers or text with a unit, as in
-        ``{"rolls.gap": ["40 mm", "60 mm"], "feed.top_size": [0.04, 0.06]}``.
+        Base scene; what is recorded of it is `record`. Of a space with scenes of its own only its resolution counts.
+    space : mapping or xarray.Dataset
+        Scene fields, by dotted or plain name, each with its values: SI numbers, quantities, or text with a unit. Fields
+        make a product, as in ``{"gap": ["40 mm", "60 mm"], "feed.top_size": [0.04, 0.06]}``, but for those
+
+        - of a tuple, ``{("gap", "roll_speed"): [("40 mm", 2.0), ("60 mm", 2.5)]}``, which vary together along
+          `sample`: lists of operating points, designs (`studies.sweep.space.sobol_design`), posterior samples;
+        - of a Dataset, or DataArrays, that share a dimension: they vary together along it.
+
+        ``{"scene": {"soft": one, "hard": other}}`` runs named scenes in turn.
     replicates : int
         Independent repetitions of every case.
     seed : int
         Seed of all randomness. Operating points share their random numbers, so curves are smooth.
     client : distributed.Client, optional
-        A dask cluster to run on; default threads of this process.
+        A dask cluster to run on; default the active client if there is one, or else threads of this process.
     threads : int
         Threads if no client is given.
     progress : bool
@@ -75,15 +81,16 @@ def sweep(
     Returns
     -------
     xarray.Dataset
-        Dims: the axes (gap, press_force, roll_speed, feed_top_size, or section and field), replicate, streamline,
-        sieve. Every summary variable of `hpgr.simulate`; `status` and `message` of every case; of gap, force, speed
-        and feed top size what is held fixed, as scalar coordinates. A case that was refused or failed holds NaN.
-        Bits do not depend on threads, workers or order, nor on what was read back.
+        Dims: of the space (gap, press_force, roll_speed, feed_top_size, or section and field; `sample`, `scene`, or the
+        user's own), replicate, streamline, sieve. Swept fields are coordinates along them. Every summary variable of
+        `hpgr.simulate`; `status` and `message` of every case; of gap, force, speed and feed top size what is held
+        fixed, as scalar coordinates. A case that was refused or failed holds NaN. Bits do not depend on threads,
+        workers or order, nor on what was read back.
 
     Raises
     ------
     ValueError
-        If an axis is no scene field, has no or doubled values, or a value that its field refuses; if cases are to be
+        If there is no such scene field, or it has no or doubled values, or one that it refuses; if cases are to be
         recorded whole and no folder is given.
     OSError
         If finished cases cannot be kept, or the scheduler is lost; what was kept before is as it was.
@@ -97,8 +104,11 @@ def sweep(
     >>> dict(result["p80_total"].sizes)
     {'gap': 2, 'replicate': 2}
     """
-    grid = axis_values(axes)
-    if "rolls.gap" in grid and (scene.rolls.specific_pressing_force or "rolls.specific_pressing_force" in grid):
+    space = Space(axes_of(space), replicates)
+    if "rolls.gap" in space.fields and (
+        "rolls.specific_pressing_force" in space.fields
+        or any(one.rolls.specific_pressing_force for one in space.bases(scene).values())
+    ):
         raise ValueError(
             "rolls.gap: got it beside rolls.specific_pressing_force, under which the gap floats; give one of them"
         )
@@ -117,7 +127,7 @@ def sweep(
     task = run.run_batch if timeout is None else isolated.run_isolated
     with ExitStack() as stack:
         kept = None if folder is None else stack.enter_context(cases.CaseFolder(folder, recompute))
-        plan = run.Plan(spec, Space(grid, int(replicates)), kept)
+        plan = run.Plan(spec, space._replace(replicates=int(replicates)), kept)
         result = assemble.assemble(plan, run.results(plan, client, threads, task, progress))
         if spec.whole:
             assemble.write_manifest(plan, result)

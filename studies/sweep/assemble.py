@@ -14,11 +14,11 @@ from hpgr.results import schema
 from hpgr.scene import Scene
 from studies.sweep import netcdf
 from studies.sweep.run import Plan
-from studies.sweep.space import AXES, CaseResult, Space
+from studies.sweep.space import AXES, SCENE, Axis, CaseResult, Space, dim_of, plain
 
 _MANIFEST = "sweep.json"
 _MOST_BYTES = 100_000_000  # of a manifest that is read: two million cases
-_FORMAT = 2
+_FORMAT = 3
 _ADDRESS = re.compile("[0-9a-f]{32}")
 _IN_FILES = {"time": "snapshot"}  # names that differ in files, see `netcdf.write_dataset`
 
@@ -26,8 +26,8 @@ _IN_FILES = {"time": "snapshot"}  # names that differ in files, see `netcdf.writ
 def assemble(plan: Plan, results: Iterable[CaseResult]) -> xr.Dataset:
     """Return one Dataset of all results over the axes and replicates, the same whatever their order."""
     spec, space = plan.spec, plan.space
-    values: dict[str, Any] = _of_axes(space)
-    values |= {
+    along = _of_axes(space)
+    values: dict[str, Any] = along | {
         "status": np.full(space.shape, schema.STATUS["failed"], np.int8),
         "message": np.full(space.shape, "", object),
         "diagnostics": np.full(space.shape, "", object),
@@ -48,31 +48,36 @@ def assemble(plan: Plan, results: Iterable[CaseResult]) -> xr.Dataset:
     attrs = schema.dataset_attributes(
         "Parametric study of comminution in high pressure grinding rolls",
         scene=spec.base.model_dump_json(),
-        axes=", ".join(space.grid),
+        axes=", ".join(space.fields),
         seed=spec.seed,
         replicates=space.replicates,
         left_out=", ".join(sorted(uneven)),
         level=spec.base.resolution.level(),
     )
     attrs |= {} if spec.tolerance is None else {"tolerance": spec.tolerance}
-    order = [*space.dims, *schema.COORDINATES, *schema.VARIABLES, *schema.SWEEP]
+    if SCENE in space.axes:
+        attrs["scenes"] = json.dumps({name: one.model_dump_json() for name, one in space.bases(spec.base).items()})
+    order = [*along, *schema.COORDINATES, *schema.VARIABLES, *schema.SWEEP]
     found = {name: values[name] for name in order if name in values and name not in uneven}
     return _labelled(space, found, attrs).assign_coords(_held(spec.base, space))
 
 
 def _of_axes(space: Space) -> dict[str, Any]:
     """Return the coordinates along the dimensions of a sweep."""
-    axes = {dim: np.array(values) for dim, values in zip(space.dims, space.grid.values(), strict=False)}
-    return axes | {"replicate": np.arange(space.replicates)}
+    found = {dim: np.array(axis.labels) for dim, axis in space.axes.items() if axis.labels is not None}
+    for axis in space.axes.values():
+        found |= {dim_of(field): np.array([place[field] for place in axis.places]) for field in axis.fields}
+    return found | {"replicate": np.arange(space.replicates)}
 
 
 def _labelled(space: Space, values: dict[str, Any], attrs: dict[str, Any]) -> xr.Dataset:
     """Return arrays over the dimensions of a sweep and those of a simulation as a Dataset."""
-    own = {dim: schema.field_axis(field, dim) for field, dim in zip(space.grid, space.dims, strict=False)}
+    own = {dim: schema.Variable((dim,), "", f"{dim} number or name", dtype=None) for dim in space.axes}
+    own |= {dim_of(field): schema.field_axis(field, dim) for dim, axis in space.axes.items() for field in axis.fields}
     for name, entry in (schema.COORDINATES | schema.VARIABLES | schema.SWEEP).items():
         if name not in space.dims and not _common(name):
             own[name] = entry._replace(dims=(*space.dims, *entry.dims))
-    return schema.to_dataset(values, attrs, own)
+    return schema.to_dataset(values, attrs, own).set_coords(list(map(dim_of, space.fields)))
 
 
 def _common(name: str) -> bool:
@@ -83,19 +88,23 @@ def _common(name: str) -> bool:
 
 def _held(base: Scene, space: Space) -> dict[str, xr.Variable]:
     """Return what a sweep holds fixed of gap, force, speed and feed top size, as scalar coordinates."""
-    rolls, feed = base.rolls, base.feed
-    floating = rolls.specific_pressing_force or AXES["press_force"] in space.grid
-    fed = any(name.startswith("feed") for name in space.grid)
-    held = {
-        "gap": None if floating else rolls.gap,
-        "press_force": rolls.specific_pressing_force,
-        "roll_speed": rolls.speed,
-        "feed_top_size": None if fed else feed.largest_grain,
-    }
+    first, *others = (_figures(one, space) for one in space.bases(base).values())
     return {
         dim: xr.Variable((), value, schema.field_axis(AXES[dim], dim).attributes())
-        for dim, value in held.items()
-        if value is not None and AXES[dim] not in space.grid
+        for dim, value in first.items()
+        if value is not None and AXES[dim] not in space.fields and all(other[dim] == value for other in others)
+    }
+
+
+def _figures(scene: Scene, space: Space) -> dict[str, float | None]:
+    """Return gap, force, speed and feed top size of a scene, None where the space or the force decides them."""
+    floating = scene.rolls.specific_pressing_force or AXES["press_force"] in space.fields
+    fed = any(name.startswith("feed") for name in space.fields)
+    return {
+        "gap": None if floating else scene.rolls.gap,
+        "press_force": scene.rolls.specific_pressing_force,
+        "roll_speed": scene.rolls.speed,
+        "feed_top_size": None if fed else scene.feed.largest_grain,
     }
 
 
@@ -116,7 +125,7 @@ def write_manifest(plan: Plan, result: xr.Dataset) -> None:
         If it cannot be written; the one of an earlier sweep is then left as it was.
     """
     told = {
-        "axes": plan.space.grid,
+        "axes": json.loads(json.dumps({dim: axis._asdict() for dim, axis in plan.space.axes.items()}, default=plain)),
         "replicates": plan.space.replicates,
         "addresses": plan.addresses,
         "status": result["status"].values.ravel().tolist(),
@@ -168,14 +177,16 @@ def open_cases(folder: str | Path) -> xr.Dataset:
     """
     folder = Path(folder)
     told = _manifest(folder / _MANIFEST)
-    space = Space(told["axes"], told["replicates"])
+    space = Space({dim: Axis(**axis) for dim, axis in told["axes"].items()}, told["replicates"])
     values = _of_axes(space) | {"status": np.array(told["status"]).reshape(space.shape)}
     paths = [
         str(folder / f"{address}.nc") if code == schema.STATUS["ok"] else ""
         for address, code in zip(told["addresses"], told["status"], strict=True)
     ]
     files = [path for path in paths if path]
-    same_grid = not any(name.startswith(("resolution", "exchange")) for name in space.grid)
+    same_grid = SCENE not in space.axes and not any(
+        name.startswith(("resolution", "exchange")) for name in space.fields
+    )
     shapes = _shapes(files[:1] if same_grid else files)
     left_out = sorted(name for name, sizes in shapes.items() if sizes is None)
     lazy = _lazily(np.array(paths, object).reshape(space.shape))

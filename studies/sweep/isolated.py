@@ -19,7 +19,7 @@ from hpgr.run import run_scene
 from hpgr.scene import Scene
 from studies.sweep.cases import code_version, pack_result, read_packed, result_of
 from studies.sweep.run import Runner, run_case, threads_here
-from studies.sweep.space import Case, CaseResult, SweepSpec
+from studies.sweep.space import Case, CaseResult, SweepSpec, plain
 
 _START = 300.0  # s that a child may take to start: it may have to compile
 _IDLE = 60.0  # s without work after which a child ends itself
@@ -96,7 +96,7 @@ class Child:
         timer.daemon = True
         timer.start()
         try:
-            self._process.stdin.write(json.dumps(message).encode() + b"\n")
+            self._process.stdin.write(json.dumps(message, default=plain).encode() + b"\n")
             self._process.stdin.flush()
             return read_packed(self._process.stdout)
         except (BrokenPipeError, EOFError):

@@ -60,7 +60,7 @@ class Runner:
         spec = self.spec
         self._scene, self._chosen = spec.base.with_values(case.values), {}
         if spec.tolerance is not None:
-            estimate = refine(self._scene, spec.tolerance, spec.max_cost, spec.seed)
+            estimate = refine(self._scene, spec.tolerance, run_scene, spec.max_cost, spec.seed)
             self._scene, self._chosen = estimate.scene, estimate.variables()
         cost.refuse_too_large(self._scene, self._room)
 
@@ -129,7 +129,9 @@ class Plan:
         self.spec, self.space, self.kept = spec, space, kept
         addresses = Addresses(spec)
         self.addresses = [addresses.of(case.values, case.replicate) for case in space.cases()]
-        self._numbers = {address: number for number, address in enumerate(self.addresses)}  # of those not yet here
+        self._numbers: dict[str, list[int]] = {}  # of those not yet here; samples may repeat an operating point
+        for number, address in enumerate(self.addresses):
+            self._numbers.setdefault(address, []).append(number)
         self._queue = deque(range(space.total))
         self._elsewhere: deque[int] = deque()  # what other drivers are computing
         self._fresh: list[CaseResult] = []  # read back, and not yet told
@@ -138,7 +140,7 @@ class Plan:
     @property
     def left(self) -> int:
         """Number of cases without a result."""
-        return len(self._numbers)
+        return sum(map(len, self._numbers.values()))
 
     def is_open(self) -> bool:
         """Return whether there are cases that neither this driver nor the folder has yet."""
@@ -156,7 +158,7 @@ class Plan:
                 break  # the replicates of an operating point share its refinement
             self._queue.popleft()
             address = self.addresses[number]
-            if address not in self._numbers:  # read back
+            if number != self._numbers.get(address, [None])[0]:  # read back, or run for another place
                 continue
             if self.kept is None or self.kept.claim(address):
                 batch.append(number)
@@ -175,21 +177,23 @@ class Plan:
         if self.kept is None:
             return
         for found in self.kept.read(self._numbers.__contains__):
-            number = self._numbers.pop(found.address)
             self.kept.release(found.address)
-            yield result_of(found.header, found.arrays, self.space.case(number).index)
+            yield from self._everywhere(result_of(found.header, found.arrays, ()), found.address)
 
-    def settle(self, result: CaseResult) -> CaseResult:
-        """Keep a computed result if it is well; return it without what has gone to a file."""
+    def settle(self, result: CaseResult) -> Iterator[CaseResult]:
+        """Keep a computed result if it is well; yield it without what has gone to a file."""
         address = self.addresses[self.space.number(result.index)]
-        self._numbers.pop(address, None)
-        if self.kept is None:
-            return result
-        if result.status != "ok":  # never counts as done
+        if self.kept is not None and result.status != "ok":  # never counts as done
             self.kept.release(address)
-            return result
-        self.kept.put(address, result)
-        return result._replace(whole=None, attrs=None)
+        elif self.kept is not None:
+            self.kept.put(address, result)
+            result = result._replace(whole=None, attrs=None)
+        yield from self._everywhere(result, address)
+
+    def _everywhere(self, result: CaseResult, address: str) -> Iterator[CaseResult]:
+        """Yield the result of an address at every place it has, which then have it."""
+        for number in self._numbers.pop(address, []):
+            yield result._replace(index=self.space.case(number).index)
 
 
 def results(plan: Plan, client: Any, threads: int, task: Task, progress: bool) -> Iterator[CaseResult]:
@@ -199,6 +203,7 @@ def results(plan: Plan, client: Any, threads: int, task: Task, progress: bool) -
         say(f"{plan.space.total - plan.left} of {plan.space.total} cases read back from {plan.kept.folder}")
     if not plan.left:
         return
+    client = active_client() if client is None else client
     if client is None:
         with own_client(threads) as own:
             yield from _computed(plan, own, task, progress)
@@ -216,7 +221,7 @@ def _computed(plan: Plan, client: Any, task: Task, progress: bool) -> Iterator[C
         say(_prediction(plan, workers))
     with progress_bar(total, progress, "cases", "{rate_fmt}, {remaining} left", total - plan.left) as bar:
         for result in dispatched(plan, client, task):
-            yield plan.settle(result)
+            yield from plan.settle(result)
             bar.update(total - plan.left - bar.n)
 
 
@@ -251,6 +256,16 @@ def _prediction(plan: Plan, workers: int) -> str:
 # ---- dask
 
 
+def active_client() -> Any:
+    """Return the client that this process has made the default; None if there is none."""
+    from distributed import default_client
+
+    try:
+        return default_client()
+    except ValueError:
+        return None
+
+
 @contextmanager
 def own_client(threads: int) -> Iterator[Any]:
     """Start a dask cluster in this process; it listens on loopback only."""
@@ -266,7 +281,7 @@ def own_client(threads: int) -> Iterator[Any]:
             worker_dashboard_address="127.0.0.1:0",
             memory_limit=0,
         ) as cluster,
-        Client(cluster) as client,
+        Client(cluster, set_as_default=False) as client,  # which another sweep must not take for the user's
     ):
         yield client
 

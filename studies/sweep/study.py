@@ -12,7 +12,7 @@ from hpgr.fields import faults_of, show, unit_shown
 from hpgr.scene import Scene, field_info
 from studies import command as line
 from studies.command import Report, shown_as
-from studies.sweep.space import AXES, Space, SweepSpec, axis_values
+from studies.sweep.space import AXES, SCENE, Axis, Space, SweepSpec, axes_of, dim_of, sobol_design
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -41,7 +41,10 @@ class Options:
     """Roll speeds to sweep, such as --roll-speed "15 rpm" "19 rpm"."""
     feed_top_size: Annotated[tuple[str, ...] | None, shown_as("LENGTH ...")] = None
     """Top sizes of the feed to sweep, such as --feed-top-size "40 mm" "60 mm"."""
-    scene: line.SceneName = "paper"
+    vary: line.Vary = ()
+    sample: Annotated[int | None, shown_as("N")] = None
+    """Points of a Sobol design, drawn over the fields that --vary gives as a range, lo..hi."""
+    scene: line.SceneNames = ("paper",)
     replicates: line.Replicates = 3
     level: line.Level = None
     cells: line.Cells = None
@@ -92,9 +95,13 @@ def _out(study: Study, options: Options) -> Path:
 
 
 def _run(study: Study, options: Options) -> Report:
-    scene = line.base_scene(options)
-    study = _floating(study, options)
-    axes = _axes(study, options, scene)
+    scenes = line.scenes_of(options)
+    scene = next(iter(scenes.values()))
+    given, ranges = _given(options)
+    study = _floating(study, [*given, *ranges])
+    space = _space(study, options, scene, given, ranges)
+    space = ({SCENE: scenes} if len(scenes) > 1 else {}) | space
+    axes = axes_of(space)
     sieve = _sieve(options, scene)
     _check(options)
     folder = _out(study, options).with_suffix(".cases")
@@ -102,7 +109,10 @@ def _run(study: Study, options: Options) -> Report:
         return Report(_cases(scene, Space(axes, options.replicates), options, folder))
     exchanging = scene.exchange is not None and study.exchange_caption
     caption = study.exchange_caption if exchanging else study.caption
-    return _report(AXES[study.main], caption, _swept(scene, axes, options, folder), sieve)
+    fields = Space(axes).fields
+    main = AXES[study.main] if AXES[study.main] in fields else fields[0]
+    caption = caption if main == AXES[study.main] else ""
+    return _report(main, caption, _swept(scene, space, options, folder), sieve)
 
 
 def _check(options: Options) -> None:
@@ -121,24 +131,39 @@ def _check(options: Options) -> None:
         )
 
 
-def _floating(study: Study, options: Options) -> Study:
+def _given(options: Options) -> tuple[dict[str, list], dict[str, tuple]]:
+    """Return the fields that the options give values of, and those of which they give a range."""
+    given = {field: list(getattr(options, dim)) for dim, field in AXES.items() if getattr(options, dim) is not None}
+    ranges: dict[str, tuple] = {}
+    for text in options.vary:
+        field, values = line.varied(text)
+        if field in given or field in ranges:
+            raise ValueError(f"--vary: got {field} twice; give it once")
+        (ranges if isinstance(values, tuple) else given)[field] = values
+    if bool(ranges) != (options.sample is not None):
+        told = f"--sample {options.sample}" if options.sample is not None else f"a range of {next(iter(ranges))}"
+        raise ValueError(f"{told}: ranges, lo..hi, and --sample go together; give both, or lo..hi:N for a grid")
+    return given, ranges
+
+
+def _floating(study: Study, fields: list[str]) -> Study:
     """Return a study of the gap as one of the pressing force, if forces are given: the gap then floats."""
-    if study.main != "gap" or options.press_force is None:
+    if study.main != "gap" or AXES["press_force"] not in fields:
         return study
-    if options.gap is not None:
+    if AXES["gap"] in fields:
         raise ValueError("--gap: got it beside --press-force, under which the gap floats; give one of them")
     return study._replace(main="press_force", caption="The gap floats under the pressing force; the nip angle is held.")
 
 
-def _axes(study: Study, options: Options, scene: Scene) -> dict[str, list]:
-    """Return the swept fields with their values, the study's own first."""
-    if scene.feed.kind == "single" and (study.main == "feed_top_size" or options.feed_top_size):
+def _space(study: Study, options: Options, scene: Scene, given: dict[str, list], ranges: dict[str, tuple]) -> dict:
+    """Return the space of the options, the study's own field first; with default values if nothing else says what."""
+    main = AXES[study.main]
+    if scene.feed.kind == "single" and "feed.top_size" in {main, *given, *ranges}:
         raise ValueError("--feed-top-size: the scene's feed is of a single size and has no top; sweep another feed")
-    order = [study.main, *(name for name in AXES if name != study.main)]
-    axes = {AXES[name]: getattr(options, name) for name in order if getattr(options, name) is not None}
-    if getattr(options, study.main) is None:
-        axes = {AXES[study.main]: _default_values(study, scene), **axes}
-    return axis_values(axes)
+    if main not in given and not ranges:
+        given = {main: _default_values(study, scene)} | given
+    space = {main: given[main]} | given if main in given else given
+    return (sobol_design(ranges, options.sample, options.seed) if ranges else {}) | space
 
 
 def _default_values(study: Study, scene: Scene) -> list[float]:
@@ -162,17 +187,17 @@ def _sieve(options: Options, scene: Scene) -> float:
     return sieve
 
 
-def _swept(scene: Scene, axes: dict[str, list], options: Options, folder: Path) -> "xr.Dataset":
+def _swept(scene: Scene, space: dict[Any, Any], options: Options, folder: Path) -> "xr.Dataset":
     from studies.sweep import sweep
 
     names = ("tolerance", "max_cost", "replicates", "seed", "recompute", "timeout", "record")
     common = {name: getattr(options, name) for name in names} | {"progress": True, "folder": folder}
     if options.scheduler is None:
-        return sweep(scene, axes, threads=options.workers, **common)
+        return sweep(scene, space, threads=options.workers, **common)
     from distributed import Client
 
     with Client(options.scheduler, timeout="10s") as client:
-        return sweep(scene, axes, client=client, **common)
+        return sweep(scene, space, client=client, **common)
 
 
 def _report(field: str, caption: str, result: "xr.Dataset", sieve: float) -> Report:
@@ -192,6 +217,18 @@ def _report(field: str, caption: str, result: "xr.Dataset", sieve: float) -> Rep
     return Report(lines, [result, line.figure(drawn)], lost)
 
 
+def _headings(dim: str, axis: Axis) -> list[str]:
+    fields = [f"{dim_of(name).replace('_', ' ')} [{unit_shown(field_info(name).unit)[0]}]" for name in axis.fields]
+    return [text.removesuffix(" [1]") for text in (fields if axis.labels is None else [dim, *fields])]
+
+
+def _place(axis: Axis, index: int) -> list[str]:
+    values = axis.places[index]
+    shown = ((values[name], field_info(name).unit) for name in axis.fields)
+    texts = [value if isinstance(value, str) else show(value, unit) for value, unit in shown]
+    return texts if axis.labels is None else [str(axis.labels[index]), *texts]
+
+
 def _cases(scene: Scene, space: Space, options: Options, folder: Path) -> list[str]:
     """Return in words what a sweep would run: its operating points, with predicted memory and time."""
     from studies.show.report import aligned
@@ -200,10 +237,11 @@ def _cases(scene: Scene, space: Space, options: Options, folder: Path) -> list[s
     scene = scene.with_values({"resolution.record": options.record})
     spec = SweepSpec(scene, options.seed, options.tolerance, options.max_cost, code=code_version())
     kept = {} if options.recompute else finished(spec, space, folder)
-    headings = [f"{dim.replace('_', ' ')} [{unit_shown(field_info(AXES[dim]).unit)[0]}]" for dim in space.dims[:-1]]
+    headings = [heading for dim, axis in space.axes.items() for heading in _headings(dim, axis)]
     rows, refused, seconds = [], [], 0.0
-    for case in Space(space.grid, 1).cases():
-        place = [show(value, field_info(name).unit) for name, value in case.values.items()]
+    for case in Space(space.axes).cases():
+        axes = zip(space.axes.values(), case.index[:-1], strict=True)
+        place = [text for axis, k in axes for text in _place(axis, k)]
         try:
             cost = predict(scene.with_values(case.values))
         except ValidationError as error:

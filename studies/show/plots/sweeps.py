@@ -33,7 +33,8 @@ def sweep_figure(result: xr.Dataset, field: str, sieve: float, caption: str) -> 
     caption : str
         Sentence under the figure.
     """
-    axis = next(name for name in report.axes_of(result) if result[name].attrs["scene_field"] == field)
+    along = (axis for dim in report.axes_of(result) for axis in report.swept(result, dim))
+    axis = next(axis for axis in along if axis.attrs.get("scene_field") == field)
     values = report.figures(result, sieve)
     headings = [heading for heading in ("throughput [t/h]", "P80 [mm]", "peak pressure [MPa]") if heading in values]
     sizes = "passing" in result
@@ -44,7 +45,7 @@ def sweep_figure(result: xr.Dataset, field: str, sieve: float, caption: str) -> 
         thinned = fineness_across_gap(panels[0, 0], panels[0, 1], result, sieve)
         product_sizes(panels[0, 2], result)
     for panel, heading in zip(panels[-1], headings, strict=True):
-        thinned |= against_axis(panel, values[heading], result[axis], heading)
+        thinned |= against_axis(panel, values[heading], axis, heading)
     words = [caption] if caption else []
     if thinned:
         words.append(f"Panels show at most {_MOST_LINES} of the operating points, evenly chosen.")
@@ -103,7 +104,8 @@ def product_sizes(panel, result: xr.Dataset) -> None:
 
 def against_axis(panel, values: xr.DataArray, axis: xr.DataArray, heading: str) -> bool:
     """Draw a figure against the swept axis, a line per value of the other axes; return whether some were left out."""
-    others = [name for name in values.dims if name not in (axis.name, "replicate")]
+    [dim] = axis.dims
+    others = [name for name in values.dims if name not in (dim, "replicate")]
     lines = values.stack(line=others, create_index=False) if others else values.expand_dims("line")
     shown = report.shown_values(axis)
     numeric = axis.dtype.kind in "fiu"
@@ -111,10 +113,11 @@ def against_axis(panel, values: xr.DataArray, axis: xr.DataArray, heading: str) 
     total = lines.sizes["line"]
     lines = lines.isel(line=_thinned(np.arange(total)))
     for k in range(lines.sizes["line"]):
-        one = lines.isel(line=k).transpose(axis.name, "replicate")
+        one = lines.isel(line=k).transpose(dim, "replicate")
         bars = report.spread(one).values
         label = ", ".join(report.value_text(values[name], lines[name].values[k]) for name in others)
         style = _style(k, lines.sizes["line"]) | {"color": str(0.6 * k / max(lines.sizes["line"] - 1, 1))}
+        style |= {} if dim == axis.name else {"linestyle": "none"}  # other fields vary along it too
         error = None if np.isnan(bars).all() else bars[order]
         panel.errorbar(shown[order], one.mean("replicate").values[order], error, label=label or None, **style)
     panel.set(xlabel=report.axis_label(axis), ylabel=heading, title=heading.partition(" [")[0])
@@ -135,7 +138,11 @@ def _shown_points(result: xr.Dataset) -> tuple[xr.Dataset, list[str], bool]:
     held = np.flatnonzero(points["p80_total"].notnull().any("replicate").values)
     chosen = _thinned(held)
     axes = report.axes_of(result)
-    labels = [", ".join(report.value_text(result[name], points[name].values[k]) for name in axes) for k in chosen]
+    places = np.unravel_index(chosen, [result.sizes[name] for name in axes])
+    labels = [
+        ", ".join(report.place_text(result, name, k) for name, k in zip(axes, place, strict=True))
+        for place in zip(*places, strict=True)
+    ]
     return points.isel(operating_point=chosen), labels, chosen.size < held.size
 
 
