@@ -1,17 +1,75 @@
 """Closed forms of crushing without cushioning (n = inf), run to completion.
 
-Without cushioning a grain breaks until it is finer than the critical size s_c, and only the smallest s_c it has met
-matters. They serve scenes with n = inf as a solver without sampling, and everything else as an oracle. They are the
-limit of small time steps: the march breaks a grain once per step, the closed forms as often as it takes.
+Without cushioning a grain breaks until it is finer than the critical size s_c, or, where strengths scatter, until it
+withstands the stress; only the smallest s_c it has met matters. They serve scenes with n = inf as a solver without
+sampling, and everything else as an oracle. They are the limit of small time steps: the march breaks a grain once per
+step, the closed forms as often as it takes.
 """
+
+import math
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
+from hpgr.grains import kernels
 from hpgr.laws.feed import Feed
+from hpgr.laws.fragments import Fragments
+from hpgr.laws.strength import Strength
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(200)  # made once: they cost more than the rest of a case
 _PARTS = 16  # that an interval is divided into while searching
 _FINEST = 1e-30  # m, below any grain; where percentiles are searched from
+_CLASSES = 30  # per factor e in size; passing is then right to 1e-4
+_BELOW_FLOOR = 0.05  # the finest class of the cascade over the size floor
+
+
+def crushed(feed: Feed, strength: Strength, fragments: Fragments, critical: np.ndarray) -> tuple[Callable, np.ndarray]:
+    """Return the product of complete crushing: its passing as a function of size, m, and its mean breaks per grain.
+
+    `critical` is any array of critical sizes, m, held at the size floor or above; sizes are broadcast against it.
+    """
+    if math.isinf(strength.scatter) and fragments.size_exponent == 0:
+        passing = partial(crushed_passing, feed, critical=critical, gamma=fragments.exponent)
+        return passing, expected_breaks(feed, critical, fragments.exponent)
+    edges, cumulative, breaks = _cascade(feed, strength, fragments, critical.ravel())
+    return partial(_between, edges, cumulative.reshape(-1, *critical.shape)), breaks.reshape(critical.shape)
+
+
+def _cascade(feed: Feed, strength: Strength, fragments: Fragments, critical: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return log edges of size classes, the product's passing there (edge, line), and the breaks per grain (line,).
+
+    A16, A17: g(s) = f0(s) + int_s^inf g(t) B(t) gamma(t) s^(gamma(t)-1) t^-gamma(t) dt is all grains ever made. Within
+    a class, of width h in log size and reached evenly, chance b and exponent gamma are those of its middle. Of grains
+    that enter, the part b (1 - exp(-a)) / a, a = gamma (1 - b) h, then leaves it in the end.
+    """
+    top = math.log(feed.largest_grain)
+    lowest = math.log(fragments.size_floor * _BELOW_FLOOR)
+    edges = np.linspace(lowest, top, math.ceil((top - lowest) * _CLASSES))
+    width, middle = edges[1] - edges[0], np.exp((edges[1:] + edges[:-1]) / 2)[:, None]
+    gamma = fragments.exponent_of(middle)
+    if math.isinf(strength.scatter):  # a step: the part of the class above s_c breaks
+        chance = np.clip((edges[1:, None] - np.log(critical)) / width, 0.0, 1.0)
+    else:
+        chance = np.where(middle < fragments.size_floor, 0.0, strength.chance(middle, critical))
+    kept = np.maximum(gamma * (1 - chance) * width, 1e-9)
+    within = -np.expm1(-kept) / kept
+    leaving = np.pad(chance * within, ((1, 0), (0, 0)))
+    feed_mass = np.diff(feed.passing(np.exp(edges)), prepend=0.0)
+    ever = np.repeat(feed_mass[:, None], critical.size, axis=1)
+    kernels.cascade(ever, leaving, np.pad(np.exp(-gamma[:, 0] * width), (1, 0)))
+    tries = chance * (1 + chance * (1 - within) / np.maximum(1 - chance, 1e-9 / (gamma * width)))
+    return edges, np.cumsum(ever * (1 - leaving), axis=0), np.sum(ever[1:] * tries, axis=0)
+
+
+def _between(edges: np.ndarray, cumulative: np.ndarray, size) -> np.ndarray:
+    """Return passing at sizes (..., *line), m, linear in log size between the edges of the cascade's classes."""
+    size = np.broadcast_to(size, np.broadcast_shapes(np.shape(size), cumulative.shape[1:]))
+    place = (np.log(np.maximum(size, math.exp(edges[0]))) - edges[0]) / (edges[1] - edges[0])
+    before = np.clip(place.astype(int), 0, edges.size - 2)
+    lines = np.ogrid[tuple(slice(n) for n in size.shape)][size.ndim - cumulative.ndim + 1 :]
+    low, high = cumulative[(before, *lines)], cumulative[(before + 1, *lines)]
+    return low + (high - low) * np.minimum(place - before, 1.0)
 
 
 def crushed_passing(feed: Feed, size, critical, gamma: float) -> np.ndarray:

@@ -49,8 +49,11 @@ class Ore(NamedTuple):
     slope: float  # 3 / w
     cushion: float  # 1 / (2 n^2)
     reference_size: float  # m
+    scatter: float  # k
     fragments: int  # tag
     inverse_exponent: float  # 1 / gamma
+    size_exponent: float  # nu
+    parent_size: float  # s_r, m
     size_floor: float  # m
 
 
@@ -687,3 +690,31 @@ def swap(parcels, bounds_outdated, largest, slots, edges, means, number, most_su
             state += _GOLDEN
             p += 1 + _skipped(uniform(state), per_cell, cells)
     return swaps
+
+
+# --- the closed form ----------------------------------------------------------------------------------------
+
+
+@_compiled
+def cascade(ever, leaving, stay):
+    """Carry the fragments of every size class down to the finer ones, from the coarsest on.
+
+    Parameters
+    ----------
+    ever : float64 (class, line)
+        Mass of the feed in each class, of equal widths in log size, finest first; on return all that ever was there.
+    leaving : float64 (class, line)
+        Part of the mass ever in a class that breaks and leaves it.
+    stay : float64 (class,)
+        Probability that a fragment that has left a class passes the next finer one as well.
+    """
+    gone = np.empty(ever.shape[1])
+    for i in range(ever.shape[0] - 1, 0, -1):
+        for line in range(gone.size):
+            gone[line] = ever[i, line] * leaving[i, line]
+        passing = 1.0
+        for j in range(i - 1, -1, -1):
+            share = passing * (1.0 - stay[i]) if j > 0 else passing
+            for line in range(gone.size):
+                ever[j, line] += share * gone[line]
+            passing *= stay[i]

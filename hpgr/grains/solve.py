@@ -113,34 +113,33 @@ def crush(scene: Scene, bed: LoadedBed, seed: int, replicate: int) -> Crushed | 
 
 
 def _closed_form(scene: Scene, log_stress: np.ndarray, slices: Slices) -> Crushed:
-    gamma, floor = scene.fragments.exponent, scene.fragments.size_floor
     feed, grid = scene.feed, scene.resolution
     highest = np.maximum.accumulate(log_stress, axis=1)
 
-    def critical_size(level):
-        return np.maximum(scene.strength.critical_size(level), floor)
+    def crushed(level):
+        critical = np.maximum(scene.strength.critical_size(level), scene.fragments.size_floor)
+        return closed_form.crushed(feed, scene.strength, scene.fragments, critical)
 
     # (slice, streamline): a stream tube of each slice leaves with the product of its own critical size
-    at_exit = critical_size(highest[:, -1] + np.log(slices.pressure)[:, None])
-    sieves = np.array(grid.sieves)
+    at_exit, breaks = crushed(highest[:, -1] + np.log(slices.pressure)[:, None])
+    sieves, tubes = np.array(grid.sieves), log_stress.shape[0]
 
     def passing(size, share=slices.share):  # size (..., streamline)
-        each = closed_form.crushed_passing(feed, size[..., None, :], at_exit, gamma)
-        return np.einsum("s,...sn->...n", share, each)
+        return np.einsum("s,...sn->...n", share, at_exit(size=size[..., None, :]))
 
     def total_passing(size, share=slices.share):
-        return passing(size, share).mean(axis=-1, keepdims=True)
+        return passing(np.repeat(size, tubes, axis=-1), share).mean(axis=-1, keepdims=True)
 
     fractions = np.array(FRACTIONS)[:, None]
     mass = None
     if grid.record == "distributions":
-        everywhere = closed_form.crushed_passing(feed, sieves, critical_size(highest)[..., None], gamma)
-        mass = np.diff(everywhere, axis=-1, prepend=0.0)[None]
+        everywhere = crushed(highest)[0](size=sieves[:, None, None])
+        mass = np.diff(np.moveaxis(everywhere, 0, -1), axis=-1, prepend=0.0)[None]
     return Crushed(
-        breaks=slices.share @ closed_form.expected_breaks(feed, at_exit, gamma),
-        below_floor=passing(np.full(at_exit.shape[1], np.nextafter(floor, 0.0))),
-        passing=passing(np.tile(sieves[:, None], at_exit.shape[1])).T,
-        percentiles=closed_form.percentile(passing, np.tile(fractions, at_exit.shape[1]), feed.largest_grain),
+        breaks=slices.share @ breaks,
+        below_floor=passing(np.full(tubes, np.nextafter(scene.fragments.size_floor, 0.0))),
+        passing=passing(np.tile(sieves[:, None], tubes)).T,
+        percentiles=closed_form.percentile(passing, np.tile(fractions, tubes), feed.largest_grain),
         total_percentiles=closed_form.percentile(total_passing, fractions, feed.largest_grain)[:, 0],
         mass_fraction=mass,
         along_width=None if scene.roll_width is None else _closed_along_width(slices, total_passing, sieves, scene),

@@ -1,5 +1,6 @@
-"""When a grain breaks: strength by size, cushioned by unlike neighbours (paper eqs. 1 and 2)."""
+"""When a grain breaks: strength by size, cushioned by unlike neighbours (paper eqs. 1 and 2); its scatter is ours."""
 
+import math
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -16,13 +17,16 @@ class StrengthConstants(NamedTuple):
     slope: float  # 3 / w
     cushion: float  # 1 / (2 n^2)
     reference_size: float  # m
+    scatter: float  # k
 
 
 class SizeEffectStrength(Frozen):
     """ln sigma_s = ln sigma_m - (3/w) ln(s/s_m) + (ln(s/sbar)/n)^2 / 2, sbar the mean over a cell and its neighbours.
 
     Bound: cushioning only strengthens, by a factor of at most exp((ln 3)^2 / (2 n^2)) for a grain among finer ones.
-    Closed limit: without cushioning (n = inf) a grain breaks until it is finer than the `critical_size`.
+    Closed limit: without cushioning (n = inf) a grain breaks until it is finer than the `critical_size`. With a scatter
+    sigma_s is multiplied by zeta, P(zeta > x) = exp(-x^k), drawn anew for every fragment: without cushioning a grain
+    then breaks with the `chance` 1 - exp(-(s/s_c)^m), m = 3 k / w.
 
     Examples
     --------
@@ -54,6 +58,10 @@ class SizeEffectStrength(Frozen):
         1.0, symbol="n", source="paper eq. 2; value ours", example=1, ge=1e-6, allow_inf_nan=True
     )
     """Cushioning constant: small n shields grains unlike their neighbours; inf: no cushioning."""
+    scatter: Number = quantity(
+        math.inf, symbol="k", source="ours (Weibull); inf: the paper", example=3, ge=0.01, allow_inf_nan=True
+    )
+    """Scatter of the strengths of equal grains: the smaller, the wider; w: Weibull's weakest link; inf: none."""
     stress: Literal["mean", "major"] = "mean"
     """Stress that crushes: 'mean' is p (the paper's figures), 'major' is p + 2 q / 3."""
 
@@ -86,6 +94,11 @@ class SizeEffectStrength(Frozen):
         with np.errstate(over="ignore"):  # a vanishing stress breaks no size: inf is the answer
             return self.reference_size * np.exp(-np.asarray(log_stress) * (self.weibull_modulus / 3))
 
+    def chance(self, size, critical):
+        """Return the probability that a grain of `size` breaks where s_c is the critical size, both m."""
+        with np.errstate(over="ignore"):
+            return -np.expm1(-((size / critical) ** (3 * self.scatter / self.weibull_modulus)))
+
     def critical_size_ratio(self, log_stress):
         """Return the least effective size over s_m that breaks at ln(sigma_a / sigma_m); inf at -inf.
 
@@ -98,7 +111,7 @@ class SizeEffectStrength(Frozen):
     def constants(self) -> StrengthConstants:
         """Return the law as the kernels take it."""
         cushion = 1 / (2 * self.cushioning * self.cushioning)  # a power would raise where the product is inf
-        return StrengthConstants(SIZE_EFFECT, 3 / self.weibull_modulus, cushion, self.reference_size)
+        return StrengthConstants(SIZE_EFFECT, 3 / self.weibull_modulus, cushion, self.reference_size, self.scatter)
 
 
 Strength = SizeEffectStrength
