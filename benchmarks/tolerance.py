@@ -19,7 +19,7 @@ def main():
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 100
     missed, figures = 0, 0
     for number, scene in enumerate(random_scenes(count)):
-        estimate = tolerance.refine(scene, WANTED)
+        estimate = tolerance.refine(scene, WANTED, run_scene)
         found, true = tolerance.figures_of(run_scene(estimate.scene).values), reference(scene)
         for name, stated in estimate.errors().items():
             error = tolerance.relative(found, true, name)

@@ -15,29 +15,16 @@ from hpgr.fields import check_seed
 from hpgr.grains import solve
 from hpgr.results import flags, metrics, schema
 from hpgr.scene import Scene
+from hpgr.tolerance import refine
 
 
 class Result(NamedTuple):
-    """What a run gives.
+    """What a run gives."""
 
-    Attributes
-    ----------
-    scene : Scene
-        The scene that was run, its gap the one that carries the pressing force.
-    bed : LoadedBed
-        Its loaded bed.
-    values : dict
-        Every variable of the Dataset by name, unrounded; None where the scene has none.
-    diagnostics : str
-        A line for each limit that was hit.
-    solver : str
-        Which solver crushed.
-    """
-
-    scene: Scene
+    scene: Scene  # that was run, its gap the one that carries the pressing force
     bed: LoadedBed
-    values: dict[str, Any]
-    diagnostics: str
+    values: dict[str, Any]  # every variable of the Dataset by name, unrounded; None where the scene has none
+    diagnostics: str  # a line for each limit that was hit
     solver: str
 
 
@@ -137,9 +124,7 @@ def simulate(
     check_seed("replicate", replicate)
     chosen = {}
     if tolerance is not None:
-        from hpgr.tolerance import refine  # it runs scenes itself
-
-        estimate = refine(scene, tolerance, max_cost, seed)
+        estimate = refine(scene, tolerance, run_scene, max_cost, seed)
         scene, chosen = estimate.scene, estimate.variables()
     cost.refuse_too_large(scene)
     result = run_scene(scene, seed, replicate)
@@ -164,8 +149,8 @@ def attributes(result: Result, title: str, seed: int, replicate: int) -> dict[st
 
 
 def _fields(bed: LoadedBed) -> dict[str, Any]:
-    motion, state = bed.kinematics, bed.stress
-    return {
+    motion, state = bed.kinematics, bed.stress._asdict()
+    return {name: field for name, field in state.items() if name in schema.VARIABLES} | {
         "xi": bed.geometry.xi,
         "x": motion.x,
         "height": motion.y,
@@ -173,12 +158,6 @@ def _fields(bed: LoadedBed) -> dict[str, Any]:
         "speed": motion.speed,
         "volumetric_strain_rate": motion.volumetric_rate,
         "shear_strain_rate": motion.shear_rate,
-        "volumetric_strain": state.volumetric_strain,
-        "shear_strain": state.shear_strain,
-        "solid_fraction": state.solid_fraction,
-        "pressure": state.pressure,
-        "shear_stress": state.shear_stress,
-        "on_shear_limit": state.on_shear_limit,
         "volume": None if bed.tessellation is None else bed.tessellation.volume,
     }
 
@@ -195,7 +174,6 @@ def _summaries(scene: Scene, bed: LoadedBed) -> dict[str, Any]:
         "peak_pressure_height": heights[highest],
         "streamline_peak_pressure": peaks,
         "streamline_peak_pressure_height": heights,
-        "continuity_solid_fraction": bed.stress.continuity_solid_fraction,
         "shear_limit_fraction": bed.stress.on_shear_limit.mean(),
     }
 

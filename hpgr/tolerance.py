@@ -6,6 +6,7 @@ others. The estimate is |bias| + 2 standard errors, relative, for P80, the fract
 """
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,8 +15,9 @@ from hpgr import cost
 from hpgr.bed.loaded import Beds
 from hpgr.grains import solve
 from hpgr.results import schema
-from hpgr.run import run_scene
 from hpgr.scene import Scene
+
+Run = Callable[..., Any]  # of scene, seed, replicate, beds; its result has `values`
 
 QUANTITIES = ("p80", "fineness", "peak_pressure")
 FINENESS_SIEVE = 1e-3  # m
@@ -55,7 +57,7 @@ class Estimate(NamedTuple):
         return {schema.ERRORS[name]: error for name, error in self.errors().items()} | used
 
 
-def refine(scene: Scene, tolerance: float, max_cost: float = 60.0, seed: int = 0) -> Estimate:
+def refine(scene: Scene, tolerance: float, run: Run, max_cost: float = 60.0, seed: int = 0) -> Estimate:
     """Return the resolution at which the estimated error of `scene` is within `tolerance`.
 
     Parameters
@@ -65,6 +67,8 @@ def refine(scene: Scene, tolerance: float, max_cost: float = 60.0, seed: int = 0
         one snapshot makes the noise smaller than estimated.
     tolerance : float
         Wanted relative error of P80, fraction below 1 mm and peak pressure; from 1e-4 to 0.5.
+    run : callable
+        `hpgr.run.run_scene`, which this module lies below.
     max_cost : float
         Predicted seconds that pilot and final run may take together.
     seed : int
@@ -77,7 +81,7 @@ def refine(scene: Scene, tolerance: float, max_cost: float = 60.0, seed: int = 0
     """
     if not 1e-4 <= tolerance <= 0.5:
         raise ValueError(f"tolerance: got {tolerance!r}; must be within 1e-4 to 0.5; such as tolerance=0.01")
-    spent = _Purse(tolerance, max_cost)
+    spent = _Purse(run, tolerance, max_cost)
     kept = {f"resolution.{name}": getattr(scene.resolution, name) for name in ("record", "snapshots")}
     scene = scene.with_values({"resolution.snapshots": 1})
     coarse, bias_lines = _enough_streamlines(scene, tolerance / 4, spent)
@@ -113,11 +117,15 @@ class _Scatter(NamedTuple):
 
 
 class _Purse:
-    """What the runs so far were predicted to cost, held against the limit before each."""
+    """Runs scenes; what they were predicted to cost so far is held against the limit before each."""
 
-    def __init__(self, tolerance: float, max_cost: float):
-        self._tolerance, self._max_cost = tolerance, max_cost
+    def __init__(self, run: Run, tolerance: float, max_cost: float):
+        self._run, self._tolerance, self._max_cost = run, tolerance, max_cost
         self.seconds = 0.0
+
+    def figures(self, scene: Scene, seed: int = 0, replicate: int = 0, beds: Beds | None = None) -> dict[str, float]:
+        """Return the judged figures of a run that was allowed."""
+        return figures_of(self._run(scene, seed, replicate, beds).values)
 
     def allow(self, seconds: float, scene: Scene) -> None:
         if not self.seconds + seconds <= self._max_cost:
@@ -164,7 +172,7 @@ def _enough_points(scene: Scene, wanted: float, spent: _Purse, seed: int):
         else:
             spent.allow(_REPLICATES * cost.predict(one).seconds, one)
             beds = Beds(1)
-            runs.append([_figures(one, seed, replicate, beds) for replicate in range(_REPLICATES)])
+            runs.append([spent.figures(one, seed, replicate, beds) for replicate in range(_REPLICATES)])
             steps = {name: _step(runs[-2], runs[-1], name) for name in ("p80", "fineness")} if len(runs) > 1 else None
             if earlier:
                 stepping = {name: _left(steps[name], earlier[name]) for name in steps}
@@ -192,7 +200,7 @@ def _smooth_figures(scene: Scene, streamlines: int, points: int, spent: _Purse) 
     if solve.choose(smooth) == "march":  # strength without size effect has no closed form: judge the pressure
         smooth = smooth.with_values({"resolution.cells": 0})
     spent.allow(2.5e-3 + 2e-6 * streamlines * points, smooth)
-    return _figures(smooth)
+    return spent.figures(smooth)
 
 
 def _step(coarse: list[dict], fine: list[dict], name: str) -> tuple[float, float]:
@@ -226,10 +234,6 @@ def relative(a: dict[str, float], b: dict[str, float], name: str) -> float:
     """Return how far figure `name` of `a` is from that of `b`, relative to the latter."""
     scale = max(abs(b[name]), _LEAST_FINENESS if name == "fineness" else 1e-300)
     return (a[name] - b[name]) / scale
-
-
-def _figures(scene: Scene, seed: int = 0, replicate: int = 0, beds: Beds | None = None) -> dict[str, float]:
-    return figures_of(run_scene(scene, seed, replicate, beds).values)
 
 
 def figures_of(values: dict[str, Any]) -> dict[str, float]:

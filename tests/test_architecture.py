@@ -9,7 +9,18 @@ from pathlib import Path
 import hpgr
 
 PACKAGE = Path(hpgr.__file__).parent
-ROOMS = [{"fields"}, {"tables"}, {"laws"}, {"scene"}, {"bed"}, {"grains"}, {"results"}, {"cost"}, {"run"}]
+ROOMS = [
+    {"fields"},
+    {"tables"},
+    {"laws"},
+    {"scene"},
+    {"bed"},
+    {"grains"},
+    {"results"},
+    {"cost"},
+    {"tolerance"},
+    {"run"},
+]
 LEVELS = {room: level for level, rooms in enumerate(ROOMS) for room in rooms} | {"presets": 4}
 WRITERS = {
     "write_text",

@@ -53,7 +53,7 @@ def test_true_error_is_within_the_stated_one_on_random_scenes():
     scenes = list(random_scenes(40 if COMPILED else 6))
     hits, figures = 0, 0
     for scene in scenes:
-        estimate = tolerance.refine(scene, WANTED)
+        estimate = tolerance.refine(scene, WANTED, run_scene)
         found, true = tolerance.figures_of(run_scene(estimate.scene).values), reference(scene)
         for name, stated in estimate.errors().items():
             assert stated <= WANTED
@@ -64,7 +64,7 @@ def test_true_error_is_within_the_stated_one_on_random_scenes():
 
 def test_smaller_tolerance_takes_a_finer_grid():
     scene = next(iter(random_scenes(1)))
-    coarse, fine = (tolerance.refine(scene, wanted).scene.resolution for wanted in (0.1, 0.005))
+    coarse, fine = (tolerance.refine(scene, wanted, run_scene).scene.resolution for wanted in (0.1, 0.005))
     assert fine.points > coarse.points
 
 
@@ -72,8 +72,8 @@ def test_smaller_tolerance_takes_a_finer_grid():
 def test_strong_cushioning_takes_more_steps():
     # model page, section 11: at n = 0.5 P80 still moves by 2 % between 800 and 1,600 points
     scene = hpgr.presets.paper().with_values({"resolution.record": "product"})
-    mild = tolerance.refine(scene, 0.02).scene.resolution.points
-    strong = tolerance.refine(scene.with_values({"strength.cushioning": 0.5}), 0.02).scene.resolution.points
+    mild = tolerance.refine(scene, 0.02, run_scene).scene.resolution.points
+    strong = tolerance.refine(scene.with_values({"strength.cushioning": 0.5}), 0.02, run_scene).scene.resolution.points
     assert strong > 1601 > mild
 
 
@@ -101,7 +101,7 @@ def test_wanted_cells_of_a_scene_without_cushioning_are_judged_as_cells():
     scene = hpgr.presets.paper().with_values({"strength.cushioning": math.inf})
     if not COMPILED:
         scene = scene.with_values({"resolution.streamlines": 1})
-    estimate = tolerance.refine(scene, 0.2 if not COMPILED else 0.05)
+    estimate = tolerance.refine(scene, 0.2 if not COMPILED else 0.05, run_scene)
     assert estimate.noise["p80"] > 0
     assert estimate.scene.resolution.record == "cells"
 

@@ -8,31 +8,13 @@ import numpy as np
 
 from hpgr.bed.loaded import LoadedBed
 from hpgr.bed.machine import Performance
-from hpgr.fields import show
-from hpgr.grains.solve import Crushed
+from hpgr.fields import show, values_of
+from hpgr.grains.solve import Crushed, crushing_stress
 from hpgr.scene import Scene
 
-# Usual machines, ores and operation (design figures of makers, as collected in the mission of this package; ore ours)
-USUAL = {
-    "roll diameter": (0.5, 2.8, "m"),
-    "surface speed": (0.2, 3.0, "m s-1"),
-    "solid density": (1500.0, 6000.0, "kg m-3"),
-    "bulk modulus": (1e6, 1e10, "Pa"),
-    "shear modulus": (1e6, 1e10, "Pa"),
-    "specific pressing force": (1e6, 9e6, "Pa"),
-    "specific energy": (3600.0, 10800.0, "J kg-1"),
-    "gap over diameter": (0.02, 0.03, "1"),
-    "exit solid fraction": (0.75, 0.92, "1"),
-}
-_INPUTS = {  # by field: its unit, the one a plant may have meant, and how many of that make the SI unit
-    "roll diameter": ("rolls.diameter", "m", "mm", 1e3),
-    "surface speed": ("rolls.speed", "rad s-1", "rpm", 60 / (2 * math.pi)),
-    "solid density": ("bed.solid_density", "kg m-3", "g/cm^3", 1e-3),
-    "bulk modulus": ("elasticity.bulk_modulus", "Pa", "MPa", 1e-6),
-    "shear modulus": ("elasticity.shear_modulus", "Pa", "MPa", 1e-6),
-}
-_FAR = 3.0  # times beyond its range from which a number is suspected of having been given in another unit
 _NIPPING = 1.5  # top size over gap above which rolls nip single grains, which is not modelled
+_FAR = 3.0  # times beyond its range from which a number is suspected of having been given in another unit
+_UNBROKEN = 0.05  # mass fraction of the feed below the critical size from which it is told
 
 
 class Run(NamedTuple):
@@ -45,24 +27,37 @@ class Run(NamedTuple):
 
 
 class Flag(NamedTuple):
-    """A limit.
-
-    Attributes
-    ----------
-    name : str
-        Its name.
-    bit : int
-        Its bit of the variable `flags`.
-    meaning : str
-        What it says of a run.
-    words : callable
-        Returns a sentence with the figures of a run that hit the limit, and nothing for one that did not.
-    """
+    """A limit."""
 
     name: str
-    bit: int
-    meaning: str
-    words: Callable[[Run], str]
+    bit: int  # of the variable `flags`
+    meaning: str  # what it says of any run
+    words: Callable[[Run], str]  # returns a sentence with the figures of a run that hit it, and nothing for others
+
+
+class Usual(NamedTuple):
+    """Range of usual machines and ores, SI, and what else a number far outside of it may have been meant as."""
+
+    low: float
+    high: float
+    unit: str
+    field: str = ""  # that it is in proportion to
+    plant_unit: str = ""  # that the field may have been meant in
+    factor: float = 1.0  # SI units of the field in one of these
+
+
+# design figures of makers, as collected in the mission of this package; densities, moduli and solid fraction ours
+USUAL = {
+    "roll diameter": Usual(0.5, 2.8, "m", "rolls.diameter", "mm", 1e-3),
+    "surface speed": Usual(0.2, 3.0, "m s-1", "rolls.speed", "rpm", math.pi / 30),
+    "solid density": Usual(1500.0, 6000.0, "kg m-3", "bed.solid_density", "g/cm^3", 1e3),
+    "bulk modulus": Usual(1e6, 1e10, "Pa", "elasticity.bulk_modulus", "MPa", 1e6),
+    "shear modulus": Usual(1e6, 1e10, "Pa", "elasticity.shear_modulus", "MPa", 1e6),
+    "specific pressing force": Usual(1e6, 9e6, "Pa"),
+    "specific energy": Usual(3600.0, 10800.0, "J kg-1"),
+    "gap over diameter": Usual(0.02, 0.03, "1"),
+    "exit solid fraction": Usual(0.75, 0.92, "1"),
+}
 
 
 def diagnose(scene: Scene, bed: LoadedBed, performance: Performance, crushed: Crushed | None) -> dict[str, str]:
@@ -85,65 +80,55 @@ def names(bits: int) -> list[str]:
 
 
 def _unusual_machine(run: Run) -> str:
-    rolls = run.scene.rolls
-    values = {
-        "roll diameter": rolls.diameter,
+    given, rolls = values_of(run.scene), run.scene.rolls
+    values = {name: given.get(usual.field) for name, usual in USUAL.items()} | {
         "surface speed": rolls.surface_speed,
-        "solid density": run.scene.bed.solid_density,
-        "bulk modulus": run.scene.elasticity.bulk_modulus,
-        "shear modulus": run.scene.elasticity.shear_modulus,
         "specific pressing force": run.performance.specific_pressing_force,
         "specific energy": run.performance.specific_energy,
         "gap over diameter": rolls.gap / rolls.diameter,
         "exit solid fraction": float(run.bed.stress.solid_fraction[:, -1].mean()),
     }
+    told = ((name, values[name], usual, given.get(usual.field)) for name, usual in USUAL.items())
     return "; ".join(
-        f"{name} {show(values[name], unit, 4)} (usual {show(low, unit)} to {show(high, unit)}"
-        f"{_meant_otherwise(run.scene, name, values[name])})"
-        for name, (low, high, unit) in USUAL.items()
-        if not low <= values[name] <= high
+        f"{name} {show(value, usual.unit, 4)} (usual {show(usual.low, usual.unit)} to {show(usual.high, usual.unit)}"
+        f"{_meant_otherwise(usual, value, field)})"
+        for name, value, usual, field in told
+        if value is not None and not usual.low <= value <= usual.high
     )
 
 
-def _meant_otherwise(scene: Scene, name: str, value: float) -> str:
+def _meant_otherwise(usual: Usual, value: float, field: float | None) -> str:
     """Return in words the unit that was probably meant, or nothing: a value far off that another unit makes usual."""
-    low, high, _ = USUAL[name]
-    if name not in _INPUTS or low / _FAR <= value <= high * _FAR:
+    low, high = usual.low / _FAR, usual.high * _FAR
+    if field is None or low <= value <= high or not low <= value * usual.factor <= high:
         return ""
-    field, unit, plant, factor = _INPUTS[name]
-    section, _, key = field.partition(".")
-    given = getattr(getattr(scene, section), key)
-    if not low / _FAR <= value / factor <= high * _FAR:
-        return ""
-    shown = show(given, unit, 4)
-    return f"; {field} {given:g} is read in {unit}, {shown}; for {given:g} {plant} write '{given:g} {plant}'"
+    unit = "rad s-1" if usual.unit == "m s-1" else usual.unit
+    meant = f"{field:g} {usual.plant_unit}"
+    return f"; {usual.field} {field:g} is read in {unit}, {show(field, unit, 4)}; for {meant} write '{meant}'"
 
 
 def _no_compaction(run: Run) -> str:
     if run.bed.stress.pressure.astype(np.float32).any():  # as it is stored: of less nothing would be seen
         return ""
-    why = (
-        "the gap equals the entry gap" if run.bed.geometry.height == 0 else "the bed only dilates on its way to the gap"
-    )
+    flat = run.bed.geometry.height == 0
+    why = "the gap equals the entry gap" if flat else "the bed only dilates on its way to the gap"
     return f"{why}: nothing is compacted nor pressed, the product is the feed"
 
 
 def _solid_fraction_capped(run: Run) -> str:
     needed, most = float(run.bed.stress.continuity_solid_fraction.max()), run.scene.bed.max_solid_fraction
-    if needed <= most:
-        return ""
-    return (
+    words = (
         f"mass continuity would need a solid fraction of {needed:.3g} at the exit; held at max_solid_fraction {most:g}"
     )
+    return words if needed > most else ""
 
 
 def _single_particle_nipping(run: Run) -> str:
     gaps = run.scene.feed.largest_grain / run.scene.rolls.gap
-    if gaps <= _NIPPING:
-        return ""
-    return (
+    words = (
         f"the feed's top size is {gaps:.3g} gaps; above {_NIPPING:g} the rolls nip single grains, which is not modelled"
     )
+    return words if gaps > _NIPPING else ""
 
 
 def _tension_clamped(run: Run) -> str:
@@ -152,10 +137,9 @@ def _tension_clamped(run: Run) -> str:
 
 
 def _no_limit_of_steps(run: Run) -> str:
-    exponent = run.scene.elasticity.exponent
-    if exponent >= 0 or not run.bed.stress.pressure.any():
-        return ""
-    return f"with elasticity.exponent {exponent:g}, below 0, stresses need not converge as time steps shrink"
+    exponent = values_of(run.scene.elasticity).get("exponent", 0.0)
+    words = f"with elasticity.exponent {exponent:g}, below 0, stresses need not converge as time steps shrink"
+    return words if exponent < 0 and run.bed.stress.pressure.any() else ""
 
 
 def _no_force_angle(run: Run) -> str:
@@ -166,6 +150,17 @@ def _no_force_angle(run: Run) -> str:
 def _no_breakage(run: Run) -> str:
     unbroken = run.crushed is not None and not run.crushed.breaks.any()
     return "no grain broke: the product is the feed" if unbroken else ""
+
+
+def _feed_below_critical(run: Run) -> str:
+    strength, crushed = run.scene.strength, run.crushed
+    if crushed is None or not crushed.breaks.any() or math.isfinite(values_of(strength).get("scatter", math.inf)):
+        return ""
+    largest = crushing_stress(run.scene, run.bed).max()
+    critical = float(strength.critical_size(strength.log_stress(largest)))
+    share = float(run.scene.feed.passing(np.nextafter(critical, 0.0)))
+    words = f"{share:.3g} of the feed is finer than {show(critical, 'm', 3)}, which no stress of this bed breaks"
+    return words if share > _UNBROKEN else ""
 
 
 def _size_floor_reached(run: Run) -> str:
@@ -188,6 +183,7 @@ FLAGS = (  # in the order in which they are told
     Flag("no_limit_of_steps", 512, "stresses need not converge as time steps shrink", _no_limit_of_steps),
     Flag("no_force_angle", 256, "more power than the force can give at any angle", _no_force_angle),
     Flag("no_breakage", 1, "no grain broke: the product is the feed", _no_breakage),
+    Flag("feed_below_critical", 1024, "part of the feed is finer than any stress breaks", _feed_below_critical),
     Flag("size_floor_reached", 16, "part of the product is below the size floor", _size_floor_reached),
     Flag("few_cells", 32, "with 2 or 3 cells every cell neighbours every other", _few_cells),
 )

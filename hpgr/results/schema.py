@@ -16,30 +16,14 @@ _LIBRARIES = ("numpy", "numba", "scipy", "shapely", "xarray", "netCDF4", "dask",
 
 
 class Variable(NamedTuple):
-    """Dims, CF attributes and storage type of one variable.
+    """Dims, CF attributes and storage type of one variable."""
 
-    Attributes
-    ----------
-    dims : tuple of str
-        Its dimensions; a sweep puts its own before them.
-    units : str
-        CF units; empty for text.
-    long_name : str
-        What it is, short enough for the axis of a plot.
-    comment : str
-        What else a reader should know.
-    dtype : type
-        How it is stored.
-    extra : Mapping
-        Further CF attributes.
-    """
-
-    dims: tuple[str, ...]
-    units: str
-    long_name: str
-    comment: str = ""
-    dtype: type = np.float32
-    extra: Mapping[str, Any] = {}
+    dims: tuple[str, ...]  # a sweep puts its own before them
+    units: str  # empty for text
+    long_name: str  # what it is, short enough for the axis of a plot
+    comment: str = ""  # what else a reader should know
+    dtype: type | None = np.float32  # None: as the values are
+    extra: Mapping[str, Any] = {}  # further CF attributes
 
     def attributes(self) -> dict[str, Any]:
         """Return the CF attributes."""
