@@ -7,6 +7,7 @@ little or nothing breaks has errors too.
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -29,17 +30,7 @@ from studies.command import (
     progress_bar,
     shown_as,
 )
-from studies.convergence import (
-    ORDERS,
-    ROUNDING,
-    SAFETY,
-    convergence_index,
-    jackknife,
-    noise_exponent,
-    observed_order,
-    pareto,
-    richardson,
-)
+from studies.convergence import ORDERS, ROUNDING, SAFETY, jackknife, pareto, richardson
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -47,25 +38,22 @@ if TYPE_CHECKING:
 _SIEVE = 1e-3  # m, of the percent below 1 mm
 _LEAST_PERCENT = 1.0  # that errors of the percent below 1 mm are divided by
 _FREE = 1e150  # cushioning so weak that it is lost in rounding: n = inf, but marched
-_LATTICE_REPLICATES = 2  # a run of the lattice takes seconds
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # step of a SplitMix64 stream
 
 
 class Quantity(NamedTuple):
-    """What errors are measured of: its variable in the Dataset, its name and unit in tables, and their factor."""
+    """What errors are measured of: its variable in the Dataset, and its name in tables."""
 
     variable: str
     shown: str
-    unit: str
-    factor: float
 
 
 QUANTITIES = {
-    "p50": Quantity("p50_total", "P50", "mm", 1e3),
-    "p80": Quantity("p80_total", "P80", "mm", 1e3),
-    "below_1mm": Quantity("passing_total", "below 1 mm", "%", 1.0),
-    "peak_pressure": Quantity("peak_pressure", "peak pressure", "MPa", 1e-6),
-    "throughput": Quantity("throughput", "throughput", "t/h", 3.6),
+    "p50": Quantity("p50_total", "P50"),
+    "p80": Quantity("p80_total", "P80"),
+    "below_1mm": Quantity("passing_total", "below 1 mm"),
+    "peak_pressure": Quantity("peak_pressure", "peak pressure"),
+    "throughput": Quantity("throughput", "throughput"),
 }
 SAMPLED = 3  # the first of them, which depend on cells
 
@@ -115,24 +103,23 @@ QUICK = Plan(
     reference=(4, 500),
     replicates=8,
 )
-_AXES = {
-    "points": "material points on a streamline",
-    "streamlines": "streamlines from the mid-plane to the roll",
-    "cells": "cells of a material point",
-    "snapshots": "snapshots of the steady machine",
-}
 
 
 class Ladder(NamedTuple):
-    """Scenes to run, each with the replicates from `first` on."""
+    """Scenes to run along the axes (the last one fastest), each with the replicates from `first` on.
 
+    `limit` takes means (rung, quantity) to what their bias is measured from; without it that is the reference.
+    """
+
+    axes: dict[str, list]
     scenes: list[Scene]
     replicates: int
+    limit: Callable[[np.ndarray], np.ndarray] | None
     first: int = 0
 
 
 class Samples(NamedTuple):
-    """Quantities (..., rung, replicate, quantity) and wall times in s (..., rung, replicate) of ladders."""
+    """Quantities (rung, replicate, quantity) of a ladder and their wall times in s (rung, replicate)."""
 
     values: np.ndarray
     seconds: np.ndarray
@@ -178,15 +165,21 @@ def study(scene: Scene, plan: Plan, seed: int = 0, progress: bool = False) -> "x
         If the scene has no cells, a single one, or exchange; or there are fewer than 2 replicates.
     """
     from hpgr import run
+    from hpgr.results import schema
 
     _refuse(scene, plan)
     scene = scene.with_values({"resolution.record": "product", "resolution.sieves": [_SIEVE]})
     ladders = _ladders(scene, plan)
-    total = sum(len(ladder.scenes) * ladder.replicates for ladder in ladders.values())
-    with progress_bar(total, progress, "runs") as bar:
+    with progress_bar(sum(len(one.scenes) * one.replicates for one in ladders.values()), progress, "runs") as bar:
         samples = {name: _climb(ladder, seed, bar) for name, ladder in ladders.items()}
-        stored = _storage(_at(scene, *plan.held), seed, plan.replicates)
-    return _dataset(run.load(scene)[0], plan, seed, samples, stored)
+    ladders["storage"] = Ladder({"storage": ["float32", "float64"]}, [], plan.replicates, _last)
+    samples["storage"] = _store(_at(scene, *plan.held), seed, plan.replicates)
+    reference, found = _limit(samples["reference"].values.mean(axis=1)), {}
+    for name, ladder in ladders.items():
+        found |= _variables(name, ladder, samples[name], reference, plan.replicates)
+    found |= _front(plan, found)
+    values, own = ({name: entry[k] for name, entry in found.items()} for k in (1, 0))
+    return schema.to_dataset(values, _attributes(run.load(scene)[0], plan, seed), own)
 
 
 def _refuse(scene: Scene, plan: Plan) -> None:
@@ -204,29 +197,44 @@ def _refuse(scene: Scene, plan: Plan) -> None:
         )
 
 
+def _limit(means: np.ndarray) -> np.ndarray:
+    return richardson(*means[-3:])
+
+
+def _first(means: np.ndarray) -> np.ndarray:
+    return means[0]
+
+
+def _last(means: np.ndarray) -> np.ndarray:
+    return means[-1]
+
+
 def _at(scene: Scene, streamlines: int, points: int, cells: int, **values: Any) -> Scene:
     grid = {"streamlines": streamlines, "points": points, "cells": cells} | values
     return scene.with_values({f"resolution.{name}": value for name, value in grid.items()})
 
 
 def _ladders(scene: Scene, plan: Plan) -> dict[str, Ladder]:
-    """Return every ladder by name; of those over points and of those of solvers the name is "points: <variant>"."""
-    (lines, points, cells), count = plan.held, plan.replicates
-    found = {
-        f"points: {name}": [_at(other, lines, p, plan.many_cells) for p in plan.points]
-        for name, other in variants(scene).items()
+    """Return every ladder by name."""
+    lines, points, _ = plan.held
+    count, few = plan.replicates, max(2, plan.replicates // 4)
+    changed, solvers, finest = variants(scene), _solvers(_at(scene, *plan.held)), list(plan.points[-3:])
+    steps = [_at(other, lines, p, plan.many_cells) for other in changed.values() for p in plan.points]
+    across = [_at(scene, n, points, plan.streamline_cells) for n in plan.streamlines]
+    counts = [_at(scene, lines, points, m) for m in plan.cells]
+    shots = [_at(scene, lines, points, plan.snapshot_cells, snapshots=n) for n in plan.snapshots]
+    grid = [_at(scene, *combination) for combination in combinations(plan)]
+    reference = [_at(scene, plan.reference[0], p, plan.reference[1]) for p in finest]
+    return {
+        "points": Ladder({"variant": list(changed), "points": list(plan.points)}, steps, count, _limit),
+        "streamlines": Ladder({"streamlines": list(plan.streamlines)}, across, count, _last),
+        "cells": Ladder({"cells": list(plan.cells)}, counts, count, _last),
+        "snapshots": Ladder({"snapshots": list(plan.snapshots)}, shots, count, _last),
+        "solver": Ladder({"solver": list(solvers)}, list(solvers.values()), few, _first),
+        "combination": Ladder({"combination": list(range(len(grid)))}, grid, count, None),
+        # replicates that the grid does not have: its errors are then not those of its own random numbers
+        "reference": Ladder({"reference_points": finest}, reference, few, _limit, first=count),
     }
-    found["streamlines"] = [_at(scene, n, points, plan.streamline_cells) for n in plan.streamlines]
-    found["cells"] = [_at(scene, lines, points, m) for m in plan.cells]
-    found["snapshots"] = [_at(scene, lines, points, plan.snapshot_cells, snapshots=n) for n in plan.snapshots]
-    found["combination"] = [_at(scene, *combination) for combination in combinations(plan)]
-    ladders = {name: Ladder(scenes, count) for name, scenes in found.items()}
-    for name, other in _solvers(_at(scene, *plan.held)).items():
-        ladders[f"solver: {name}"] = Ladder([other], _LATTICE_REPLICATES if name == "lattice" else count)
-    lines, cells = plan.reference
-    # replicates that the grid does not have: its errors are then not those of its own random numbers
-    reference = [_at(scene, lines, p, cells) for p in plan.points[-3:]]
-    return ladders | {"reference": Ladder(reference, max(2, count // 4), first=count)}
 
 
 def variants(scene: Scene) -> dict[str, Scene]:
@@ -282,32 +290,25 @@ def _run(scene: Scene, seed: int, replicate: int) -> tuple[list[float], float]:
     return [float(values[quantity.variable]) for quantity in QUANTITIES.values()], seconds
 
 
-def _storage(scene: Scene, seed: int, replicates: int) -> dict[str, np.ndarray]:
-    """Return what storing cells as float64 instead of float32 changes, by replicate; the feed is the same.
-
-    `difference` (replicate, quantity) is relative; `cells_apart` the fraction of cells that end more than rounding
-    apart, as a decision fell the other way.
-    """
+def _store(scene: Scene, seed: int, replicates: int) -> Samples:
+    """Crush the same feed with cells stored as float32 and as float64, in plain NumPy."""
     from hpgr import run
     from hpgr.grains import march, solve
 
     scene, bed = run.load(scene)
     log_stress = scene.strength.log_stress(solve.crushing_stress(scene, bed))
-    products = np.empty((2, replicates, len(log_stress), scene.resolution.cells))
-    for k, dtype in enumerate((np.float32, np.float64)):
-        for replicate, line in np.ndindex(products.shape[1:3]):
-            sizes, streams = (part[0, 1:-1] for part in march.first_cells(scene, seed, [(replicate, line, 0)]))
-            sizes = sizes.astype(dtype)
-            plain_march(scene, sizes, streams, log_stress[line])
-            products[k, replicate, line] = sizes
-    p50, p80 = np.quantile(products, (0.5, 0.8), axis=(2, 3))
-    below = 100 * (products <= np.float64(np.float32(_SIEVE))).mean(axis=(2, 3))
-    single, double = np.stack([p50, p80, below], axis=-1)
-    apart = np.abs(products[0] - products[1]) > 1e-4 * products[1]
-    return {
-        "difference": (single - double) / np.maximum(double, [0, 0, _LEAST_PERCENT]),
-        "cells_apart": apart.mean(axis=(1, 2)),
-    }
+    values, seconds = np.full((2, replicates, len(QUANTITIES)), np.nan), np.empty((2, replicates))
+    for k, replicate in np.ndindex(seconds.shape):
+        begun = time.perf_counter()
+        keys = [(replicate, line, 0) for line in range(len(log_stress))]
+        sizes, streams = (part[:, 1:-1].copy() for part in march.first_cells(scene, seed, keys))
+        sizes = sizes.astype((np.float32, np.float64)[k])
+        for line, stress in enumerate(log_stress):
+            plain_march(scene, sizes[line], streams[line], stress)
+        percent = 100 * (sizes <= np.float64(np.float32(_SIEVE))).mean()
+        values[k, replicate, :SAMPLED] = [*np.quantile(sizes, (0.5, 0.8)), percent]
+        seconds[k, replicate] = time.perf_counter() - begun
+    return Samples(values, seconds)
 
 
 def plain_march(scene: Scene, sizes: np.ndarray, streams: np.ndarray, log_stress: np.ndarray) -> None:
@@ -328,12 +329,38 @@ def plain_march(scene: Scene, sizes: np.ndarray, streams: np.ndarray, log_stress
         sizes[hit] = np.maximum(wide[hit] * uniform ** (1 / fragments.exponent), kernels.SMALLEST)
 
 
-def _limit(means: np.ndarray) -> np.ndarray:
-    return richardson(*means[-3:])
+def _variables(name: str, ladder: Ladder, samples: Samples, reference: np.ndarray, count: int) -> dict[str, tuple]:
+    """Return the table entry and the values of samples, wall time, bias and noise of a ladder, and of its axes."""
+    from hpgr.results.schema import VARIABLES, Variable
 
-
-def _last(means: np.ndarray) -> np.ndarray:
-    return means[-1]
+    dims, shape = tuple(ladder.axes), tuple(map(len, ladder.axes.values()))
+    # only ladders of as many replicates share a dimension
+    replicate = "replicate" if ladder.replicates == count else f"{name}_replicate"
+    found: dict[str, tuple] = {}
+    for axis, rungs in ladder.axes.items():
+        units = "" if isinstance(rungs[0], str) else "1"
+        found[axis] = Variable((axis,), units, axis.replace("_", " "), dtype=None), rungs
+    for k, (quantity, entry) in enumerate(QUANTITIES.items()):
+        units = "percent" if quantity == "below_1mm" else VARIABLES[entry.variable].units
+        own = Variable((*dims, replicate), units, f"{entry.shown}, over {name}", dtype=None)
+        found[f"{name}_{quantity}"] = own, samples.values[..., k].reshape(*shape, -1)
+    errors = []
+    limit = ladder.limit or (lambda means: reference)
+    for row in samples.values.reshape(-1, shape[-1], *samples.values.shape[1:]):
+        means = row.mean(axis=1)
+        scale, away = _scales(limit(means)), jackknife(lambda part: part - limit(part), row)
+        errors.append(((means - limit(means)) / scale, away / scale, _noise(row, scale)))
+    words = {
+        "bias": "bias, relative",
+        "bias_error": "standard error of the bias, relative",
+        "noise": "standard deviation of one run over replicates, relative",
+    }
+    for (key, what), each in zip(words.items(), zip(*errors, strict=True), strict=True):
+        own = Variable((*dims, "quantity"), "1", f"{what}, over {name}", dtype=None)
+        found[f"{name}_{key}"] = own, np.reshape(each, (*shape, len(QUANTITIES)))
+    own = Variable(dims, "s", f"median wall time of a run, over {name}", dtype=None)
+    found[f"{name}_wall_time"] = own, np.median(samples.seconds, axis=-1).reshape(shape)
+    return found
 
 
 def _scales(values: np.ndarray) -> np.ndarray:
@@ -349,145 +376,30 @@ def _noise(samples: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return np.where(found > ROUNDING, found, 0.0)
 
 
-class _Sheet:
-    """The study's variables by name, each with its dims, unit and words."""
+def _front(plan: Plan, found: dict[str, tuple]) -> dict[str, tuple]:
+    """Return the work-precision grid: streamlines, points, cells and level, errors, and the Pareto front."""
+    from functools import partial
 
-    def __init__(self):
-        self.values: dict[str, Any] = {}
-        self.own: dict[str, Any] = {}
+    from hpgr.results.schema import Variable
 
-    def put(self, name: str, dims: tuple[str, ...], values: Any, long_name: str, units: str = "1") -> None:
-        from hpgr.results.schema import Variable
-
-        self.values[name], self.own[name] = values, Variable(dims, units, long_name, dtype=None)
-
-    def put_each(self, name: str, dims: tuple[str, ...], values: np.ndarray, words: str) -> None:
-        """Put values (..., quantity) in the unit of each quantity, under `name`_<quantity>."""
-        from hpgr.results.schema import VARIABLES
-
-        for k, (quantity, entry) in enumerate(QUANTITIES.items()):
-            units = "percent" if quantity == "below_1mm" else VARIABLES[entry.variable].units
-            self.put(f"{name}_{quantity}", dims, values[..., k], f"{entry.shown}, {words}", units)
-
-
-def _dataset(scene: Scene, plan: Plan, seed: int, samples: dict[str, Samples], stored) -> "xr.Dataset":
-    """Return everything measured, and what follows from it, labelled."""
-    from hpgr.results import schema
-
-    sheet, limit = _Sheet(), _limit(samples["reference"].values.mean(axis=1))
-    by = {
-        kind: {name.removeprefix(f"{kind}: "): one for name, one in samples.items() if name.startswith(f"{kind}: ")}
-        for kind in ("points", "solver")
-    }
-    sheet.put("quantity", ("quantity",), list(QUANTITIES), "quantity an error is of", "")
-    sheet.put("variant", ("variant",), list(by["points"]), "scene as it is, or with one value changed", "")
-    sheet.put("solver", ("solver",), list(by["solver"]), "solver of the scene without cushioning", "")
-    for name, what in _AXES.items():
-        sheet.put(name, (name,), np.array(getattr(plan, name), np.int32), what)
-    points = Samples(*(np.stack(part) for part in zip(*by["points"].values(), strict=True)))
-    _put_ladder(sheet, "points", ("variant", "points"), points, _limit)
-    for name in ("streamlines", "cells", "snapshots"):
-        _put_ladder(sheet, name, (name,), samples[name], _last)
-        noises = sheet.values[f"{name}_noise"].T
-        exponents = [noise_exponent(getattr(plan, name), one, plan.replicates) for one in noises]
-        for ending, column in zip(("", "_error"), np.transpose(exponents), strict=True):
-            words = f"{'standard error of the ' if ending else ''}exponent of noise against {name}"
-            sheet.put(f"{name}_noise_exponent{ending}", ("quantity",), column, words)
-    _put_convergence(sheet, points.values)
-    _put_solvers(sheet, list(by["solver"].values()))
-    _put_storage(sheet, stored)
-    _put_reference(sheet, samples["reference"].values, limit)
-    _put_combinations(sheet, plan, samples["combination"], limit)
-    return schema.to_dataset(sheet.values, _attributes(scene, plan, seed), sheet.own)
-
-
-def _put_ladder(sheet: _Sheet, name: str, dims: tuple[str, ...], samples: Samples, limit) -> None:
-    """Put samples, wall time, bias and noise; bias is measured from `limit` of the means."""
-    sheet.put_each(name, (*dims, "replicate"), samples.values, f"over {name}")
-    found = []
-    for row in samples.values.reshape(-1, *samples.values.shape[-3:]):
-        means = row.mean(axis=1)
-        away, scale = limit(means), _scales(limit(means))
-        error = jackknife(lambda part: part - limit(part), row)
-        found.append(((means - away) / scale, error / scale, _noise(row, scale)))
-    words = {
-        "bias": "bias, relative",
-        "bias_error": "standard error of the bias, relative",
-        "noise": "standard deviation of one run over replicates, relative",
-    }
-    shape = (*samples.seconds.shape[:-1], len(QUANTITIES))
-    for (key, what), each in zip(words.items(), zip(*found, strict=True), strict=True):
-        sheet.put(f"{name}_{key}", (*dims, "quantity"), np.reshape(each, shape), f"{what}, over {name}")
-    median = np.median(samples.seconds, axis=-1)
-    sheet.put(f"{name}_wall_time", dims, median, f"median wall time of a run, over {name}", "s")
-
-
-def _put_convergence(sheet: _Sheet, values: np.ndarray) -> None:
-    """Put observed orders at every rung but the first two, Richardson's limit, and the grid convergence index."""
-    means = values.mean(axis=2)
-    order = np.full(means.shape, np.nan)
-    order[:, 2:] = observed_order(means[:, :-2], means[:, 1:-1], means[:, 2:])
-    last = np.array([jackknife(lambda part: observed_order(*part[-3:]), row) for row in values])
-    finest = means[:, -3:].transpose(1, 0, 2)
-    limit = richardson(*finest)
-    index, dims = convergence_index(*finest) / _scales(limit), ("variant", "quantity")
-    words = "observed order of convergence in the time step, this rung the finest of three"
-    sheet.put("order", ("variant", "points", "quantity"), order, words)
-    sheet.put("order_error", dims, last, "standard error of the order at the finest rung")
-    sheet.put("convergence_index", dims, index, f"grid convergence index, safety factor {SAFETY}, relative")
-    sheet.put_each("limit", ("variant",), limit, "Richardson's limit over points")
-
-
-def _put_solvers(sheet: _Sheet, samples: list[Samples]) -> None:
-    """Put wall time of the solvers, and their difference from the first and from the march."""
-    first = samples[0].values[0].mean(axis=0)
-    scale, dims = _scales(first), ("solver", "quantity")
-    march, lattice = (each.values[0] for each in samples[-2:])
-    shared = min(len(march), len(lattice))
-    apart = np.abs(lattice[:shared] - march[:shared]).max(axis=0) / scale
-    bias = np.array([(each.values[0].mean(axis=0) - first) / scale for each in samples])
-    noise = np.array([_noise(each.values[0], scale) for each in samples])
-    sheet.put("solver_bias", dims, bias, "mean less that of the first solver, relative")
-    sheet.put("solver_noise", dims, noise, "standard deviation of one run over replicates, relative")
-    sheet.put("lattice_less_march", ("quantity",), apart, "largest difference of the lattice from the march, relative")
-    sheet.put("solver_replicates", ("solver",), [each.seconds.size for each in samples], "replicates run")
-    sheet.put("solver_wall_time", ("solver",), [np.median(each.seconds) for each in samples], "median wall time", "s")
-
-
-def _put_storage(sheet: _Sheet, stored: dict[str, np.ndarray]) -> None:
-    names = list(QUANTITIES)[:SAMPLED]
-    sheet.put("sampled_quantity", ("sampled_quantity",), names, "quantity that depends on cells", "")
-    words = "cells stored as float32 less as float64, plain NumPy rule, relative"
-    sheet.put("storage_difference", ("replicate", "sampled_quantity"), stored["difference"], words)
-    words = "fraction of cells that storage brings to another size, beyond rounding"
-    sheet.put("storage_cells_apart", ("replicate",), stored["cells_apart"], words)
-
-
-def _put_reference(sheet: _Sheet, values: np.ndarray, limit: np.ndarray) -> None:
-    index, scale = convergence_index(*values.mean(axis=1)), _scales(limit)
-    sheet.put_each("reference", (), limit, "reference of the work-precision grid")
-    error = jackknife(_limit, values) / scale
-    sheet.put("reference_error", ("quantity",), error, "standard error of the reference, relative")
-    words = f"grid convergence index of the reference, safety factor {SAFETY}, relative"
-    sheet.put("reference_convergence_index", ("quantity",), index / scale, words)
-
-
-def _put_combinations(sheet: _Sheet, plan: Plan, samples: Samples, limit: np.ndarray) -> None:
-    """Put the work-precision grid: bias, noise and error of every combination, wall time, and the Pareto front."""
-    rows, dims = combinations(plan), ("combination",)
-    for axis, column in zip(("streamlines", "points", "cells"), np.array(rows, np.int32).T, strict=True):
-        sheet.put(f"combination_{axis}", dims, column, f"{_AXES[axis]}, of the combination")
+    entry, rows = partial(Variable, ("combination",), "1", dtype=None), combinations(plan)
+    axes = zip(("streamlines", "points", "cells"), np.array(rows, np.int32).T, strict=True)
+    grid = {f"combination_{axis}": (entry(f"{axis} of the combination"), column) for axis, column in axes}
     names = {_grid_of(name): name for name in plan.levels}
-    level = [names.get(row, "") for row in rows]
-    sheet.put("combination_level", dims, level, "named level of the combination, if any", "")
-    _put_ladder(sheet, "combination", dims, samples, lambda means: limit)
-    error = np.abs(sheet.values["combination_bias"]) + 2 * sheet.values["combination_noise"]
-    sheet.put("combination_error", (*dims, "quantity"), error, "|bias| + 2 standard errors of one run, relative")
+    error = np.abs(found["combination_bias"][1]) + 2 * found["combination_noise"][1]
     worst = error[:, :SAMPLED].max(axis=1)
+    front = pareto(found["combination_wall_time"][1], worst).astype(np.int8)
     words = "largest error of P50, P80 and percent below 1 mm, relative"
-    sheet.put("combination_worst_error", dims, worst, words)
-    front = pareto(sheet.values["combination_wall_time"], worst).astype(np.int8)
-    sheet.put("combination_on_front", dims, front, "whether no other combination is as cheap and as accurate")
+    return grid | {
+        "quantity": (Variable(("quantity",), "", "quantity an error is of", dtype=None), list(QUANTITIES)),
+        "combination_level": (entry("named level, if any")._replace(units=""), [names.get(row, "") for row in rows]),
+        "combination_error": (
+            entry("|bias| + 2 standard errors of one run, relative")._replace(dims=("combination", "quantity")),
+            error,
+        ),
+        "combination_worst_error": (entry(words), worst),
+        "combination_on_front": (entry("whether no other combination is as cheap and as accurate"), front),
+    }
 
 
 def _attributes(scene: Scene, plan: Plan, seed: int) -> dict[str, Any]:
@@ -502,6 +414,7 @@ def _attributes(scene: Scene, plan: Plan, seed: int) -> dict[str, Any]:
         scene=scene.model_dump_json(),
         seed=seed,
         replicates=plan.replicates,
+        sampled_quantities=SAMPLED,
         held="streamlines {}, points {}, cells {}".format(*plan.held),
         cells_while_refined=f"points {plan.many_cells}, streamlines {plan.streamline_cells}, "
         f"snapshots {plan.snapshot_cells}",

@@ -1,4 +1,4 @@
-"""What refinement tells of an error: order, limit and index of three grids, exponent of noise, Pareto front."""
+"""What refinement tells of an error: order and limit of three grids, exponent of noise, Pareto front."""
 
 from collections.abc import Callable
 
@@ -27,11 +27,6 @@ def richardson(coarse, medium, fine) -> np.ndarray:
     """
     order = np.clip(np.nan_to_num(observed_order(coarse, medium, fine), nan=ORDERS[0]), *ORDERS)
     return fine + (fine - medium) / (2**order - 1)
-
-
-def convergence_index(coarse, medium, fine) -> np.ndarray:
-    """Return the grid convergence index of the finest of three grids in its own unit, SAFETY |limit - fine|."""
-    return SAFETY * np.abs(richardson(coarse, medium, fine) - fine)
 
 
 def noise_exponent(sizes, noise, replicates: int) -> tuple[float, float]:
