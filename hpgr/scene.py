@@ -31,13 +31,13 @@ from hpgr.fields import (
     show,
     valid_alone,
 )
-from hpgr.laws.elasticity import Elasticity
+from hpgr.laws.elasticity import Elasticity, GranularElasticity
 from hpgr.laws.exchange import Exchange
 from hpgr.laws.feed import Feed
 from hpgr.laws.flow import Flow, PowerFlow, cake_nip_angle, densest_ratio
-from hpgr.laws.fragments import Fragments
+from hpgr.laws.fragments import Fragments, PowerLawFragments
 from hpgr.laws.roll_width import RollWidth
-from hpgr.laws.strength import Strength
+from hpgr.laws.strength import SizeEffectStrength, Strength
 
 DATA = Path(str(files("hpgr") / "data"))  # presets, resolutions, pilot tests
 LEAST_GAP = 1e-6  # m
@@ -244,11 +244,11 @@ class Scene(Frozen):
     """Density and packing of the bed."""
     flow: Flow = PowerFlow()
     """How the bed moves."""
-    elasticity: Elasticity = Elasticity()
+    elasticity: Elasticity = GranularElasticity()
     """How the bed is loaded; default: the paper's sand."""
-    strength: Strength = Strength()
+    strength: Strength = SizeEffectStrength()
     """When a grain breaks; default: the paper's quartz."""
-    fragments: Fragments = Fragments()
+    fragments: Fragments = PowerLawFragments()
     """What a broken grain leaves."""
     exchange: Exchange | None = None
     """Segregation and mixing; None switches both off."""
