@@ -209,9 +209,14 @@ def _report(field: str, caption: str, result: "xr.Dataset", sieve: float) -> Rep
     sayings = [*report.change(result, field), caption]
 
     def drawn() -> Any:
-        from studies.show.plots import sweeps
+        from studies.show.plots import maps, sweeps
 
-        return sweeps.sweep_figure(result, field, sieve, "\n".join(sayings))
+        words = "\n".join(sayings)
+        return (
+            maps.maps_figure(result, sieve, words)
+            if maps.is_map(result)
+            else sweeps.sweep_figure(result, field, sieve, words)
+        )
 
     lines = [report.table(result, sieve), *report.remarks(result), *sayings]
     return Report(lines, [result, line.figure(drawn)], lost)

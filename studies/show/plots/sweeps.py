@@ -51,13 +51,18 @@ def sweep_figure(result: xr.Dataset, field: str, sieve: float, caption: str) -> 
         words.append(f"Panels show at most {_MOST_LINES} of the operating points, evenly chosen.")
     if result.sizes["replicate"] > 1:
         words.append(f"Mean of {result.sizes['replicate']} replicates; bars: ± one standard deviation.")
-    words += [line[0].upper() + line[1:] + "." for line in report.flagged(result)]
-    remark = scene_of(result).remark
-    words += [f"Scene: {remark}."] if remark else []
-    width = int(14 * figure.get_figwidth())  # letters
-    folded = [textwrap.fill(line, width) for line in "\n".join(words).splitlines()]
-    figure.supxlabel("\n".join(folded), fontsize=9)
+    caption_under(figure, result, "\n".join(words))
     return figure
+
+
+def caption_under(figure: Figure, result: xr.Dataset, words: str) -> None:
+    """Write under a figure its own words, the limits that were hit, and the remark of the scene."""
+    lines = [words, *(line[0].upper() + line[1:] + "." for line in report.flagged(result))]
+    remark = scene_of(result).remark
+    lines += [f"Scene: {remark}."] if remark else []
+    width = int(14 * figure.get_figwidth())  # letters
+    folded = [textwrap.fill(line, width) for line in "\n".join(lines).splitlines()]
+    figure.supxlabel("\n".join(folded), fontsize=9)
 
 
 def fineness_across_gap(left, right, result: xr.Dataset, sieve: float) -> bool:
