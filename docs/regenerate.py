@@ -11,7 +11,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from studies import accuracy, extremes, gap_sweep, paper, pilot, store
+from studies import accuracy, extremes, gap_sweep, paper, pilot
+from studies.sweep import netcdf
 
 DOCS = Path(__file__).parent
 BY_HAND = ("explore.png",)  # a screenshot of a browser
@@ -52,7 +53,7 @@ def put(drawn: Path, place: Path) -> None:
             few = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)
         few.save(drawn, optimize=True)
     content = drawn.read_bytes()
-    store.replace(place, lambda part: part.write_bytes(content))
+    netcdf.replace(place, lambda part: part.write_bytes(content))
     print(f"{place}: {len(content):,} bytes")
 
 
