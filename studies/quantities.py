@@ -1,11 +1,14 @@
 """What a study is asked about, by name: "throughput", "specific energy", "P80", "passing 6 mm"; with values as text."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hpgr.fields import parse, show, unit_shown
 from hpgr.results import schema
 from hpgr.scene import Scene
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 _NAMES = {"p50": "p50_total", "p80": "p80_total", "energy": "specific_energy"}
 _PASSING = "passing"
@@ -88,9 +91,7 @@ def quantity_of(name: str) -> Quantity:
     variable = _NAMES.get(variable, variable)
     entry = schema.VARIABLES.get(variable)
     if entry is None or entry.dims or variable == "flags":
-        known = [
-            one for one, entry in schema.VARIABLES.items() if not entry.dims and not one.endswith(("used", "error"))
-        ]
+        known = [one for one, entry in schema.VARIABLES.items() if not entry.dims and entry.units != "1"]
         raise ValueError(f"a run has no figure {name!r}; give 'passing 6 mm', or one of {', '.join(known)}")
     return Quantity(variable, entry.units, entry.long_name.partition(",")[0])
 
@@ -105,3 +106,14 @@ def with_sieves(scene: Scene, quantities: Iterable[Quantity]) -> Scene:
     if not any(one.of_product for one in quantities):
         values["resolution.cells"] = 0
     return scene.with_values(values)
+
+
+def refuse_lost(result: "xr.Dataset") -> None:
+    """Raise ValueError if a case of a sweep holds no result."""
+    from studies.show import report
+
+    lost = report.lost_cases(result)
+    if lost:
+        raise ValueError(
+            f"{len(lost)} of {result['status'].size} cases are lost; narrow the ranges; the first: {lost[0]}"
+        )
