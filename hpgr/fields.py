@@ -42,7 +42,10 @@ UNITS = {
 
 # stricter than pint, which reads past what it does not understand ("60; mm") and sums up ("60 mm + 1 m")
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|[+-]?(?:nan|inf)(?=\s)"
-_QUANTITY = re.compile(rf"\s*({_NUMBER})\s*([a-zµμ][\w*/^.-]*)?\s*", re.IGNORECASE)
+_QUANTITY = re.compile(rf"\s*({_NUMBER})\s*((?:1/)?[a-zµμ][\w*/^.·-]*)?\s*", re.IGNORECASE)
+_POWER = re.compile(r"(?<=[a-zµμ])(?=[23](?!\d))")  # "N/mm2" is N/mm^2
+_WRITTEN = str.maketrans("²³·", "23*")
+_TURNS = {"1/min", "min-1", "min^-1", "U/min"}  # as plants write rpm
 _FAULTS = {"UndefinedUnitError": "is not known", "DimensionalityError": "measures something else"}  # pint's names
 _ANGLE = re.compile("rpm|rad|deg|rev|turn")  # pint takes 1 Hz for 1 rad/s
 
@@ -79,11 +82,13 @@ def parse(text: str, unit: str) -> float:
     found = _QUANTITY.fullmatch(text)
     if not found:
         raise ValueError(f"not a number and a unit; write it like '{known.example}'")
-    number, named = float(found[1]), (found[2] or "").strip()
+    number, named = float(found[1]), _POWER.sub("^", (found[2] or "").translate(_WRITTEN))
     if not named:
         raise ValueError(f"text without a unit; write it as '{text.strip()} {known.shown}', or as a number in {unit}")
-    if unit == "rad s-1" and not _ANGLE.search(named):
-        raise ValueError("not a rate of turning; write it like '19 rpm' or '2 rad/s'")
+    if unit == "rad s-1":
+        named = "rpm" if named in _TURNS else named
+        if not _ANGLE.search(named):
+            raise ValueError("not a rate of turning; write it like '19 rpm' or '2 rad/s'")
     try:
         magnitude = float((number * _registry().Unit(named)).to(known.pint).magnitude)
     except (PintError, ArithmeticError, AttributeError, TypeError, ValueError, AssertionError) as error:

@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import BaseModel, BeforeValidator, ValidationError
+from pydantic import BaseModel, BeforeValidator, ValidationError, model_validator
 
 from hpgr.fields import (
     Count,
@@ -26,6 +26,7 @@ from hpgr.fields import (
     RadiansPerSecond,
     fault_in_words,
     kinds_of,
+    parse,
     parts_of,
     quantity,
     show,
@@ -78,6 +79,19 @@ class Rolls(Frozen):
         0.0, symbol="T_0", unit="N m", source="machine (calibrated); 0: none", example="2 kN*m", ge=0, le=1e9
     )
     """Torque of both drives that does not go into the bed."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_surface(cls, data: Any) -> Any:
+        """Return the fields with a speed of the roll surface, such as "1.5 m/s", as that of the roll."""
+        speed = data.get("speed") if isinstance(data, Mapping) else None
+        if not isinstance(speed, str) or not speed.rstrip().endswith("m/s"):
+            return data
+        try:
+            diameter = valid_alone(cls, "diameter", data.get("diameter"))
+            return {**data, "speed": 2 * parse(speed, "m s-1") / diameter}
+        except ValueError:  # told of the field itself
+            return data
 
     @property
     def surface_speed(self) -> float:
@@ -292,7 +306,7 @@ class Scene(Frozen):
         """
         path = Path(path)
         try:
-            text = path.read_text(encoding="utf-8")
+            text = path.read_text(encoding="utf-8-sig")
         except UnicodeDecodeError as error:
             raise ValueError(f"{path}: byte {error.start} is not UTF-8; save the scene as text in UTF-8") from None
         if path.suffix == ".json":

@@ -19,6 +19,11 @@ from hpgr.fields import UNITS, check_seed, parse, show
         ("19 rpm", "rad s-1", 19 * 2 * math.pi / 60),
         ("2 rad/s", "rad s-1", 2.0),
         ("2.65 g/cm^3", "kg m-3", 2650.0),
+        ("2.65 t/m3", "kg m-3", 2650.0),
+        ("3.5 N/mm2", "Pa", 3.5e6),
+        ("3.5 N/mm²", "Pa", 3.5e6),
+        ("19 1/min", "rad s-1", 19 * 2 * math.pi / 60),
+        ("1.5 kWh/t", "J kg-1", 5400.0),
     ],
 )
 def test_text_with_a_unit_becomes_si(text, unit, value):

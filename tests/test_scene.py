@@ -522,3 +522,16 @@ def test_a_field_judges_a_value_alone():
     ):
         with pytest.raises(ValueError, match=words):
             field_value(name, value)
+
+
+def test_speed_of_the_roll_surface_is_taken_with_its_unit():
+    scene = presets.industrial().with_values({"rolls.diameter": "2 m", "rolls.speed": "1.5 m/s"})
+    assert scene.rolls.speed == 1.5
+    with pytest.raises(ValidationError, match=r"rolls.speed\n.*got '1.5 m/s'"):
+        presets.industrial().with_values({"rolls.diameter": "x", "rolls.speed": "1.5 m/s"})
+
+
+def test_scene_files_may_begin_with_a_byte_order_mark(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('base = "paper"\n', encoding="utf-8-sig")
+    assert Scene.from_file(path) == presets.paper()
