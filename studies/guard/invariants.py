@@ -9,7 +9,9 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import xarray as xr
+from pydantic import ValidationError
 
+from hpgr.fields import faults_of
 from hpgr.grains import kernels, march
 from hpgr.grains.lattice import MOST_SUBSTEPS
 from hpgr.results import flags, metrics
@@ -17,6 +19,7 @@ from hpgr.scene import Scene
 
 _ROUNDING = 2.0**-22  # relative; a float32 is good to 2**-24, a quotient or mean of some to a few of that
 _TINY = 1e-36  # below it float32 has fewer digits, and at last none
+_CARRIED = 2e-6  # relative, of a pressing force under which the gap floats; half of it is the rounding to float32
 _NIPPING = 1.5  # gaps, top size of the feed from which single grains are nipped
 
 
@@ -30,7 +33,10 @@ def violations(dataset: xr.Dataset) -> list[str]:
     >>> violations(hpgr.simulate(hpgr.presets.paper().with_values({"resolution.cells": 50})))
     []
     """
-    scene = Scene.model_validate_json(dataset.attrs["scene"])
+    try:
+        scene = Scene.model_validate_json(dataset.attrs["scene"])
+    except ValidationError as error:
+        return [f"a scene that can be read back: {faults_of(error)}"]
     result = Result({name: variable.values for name, variable in dataset.variables.items()})
     result.attrs = dataset.attrs
     found = []
@@ -127,6 +133,26 @@ def _throughput(scene: Scene, result: Result) -> Iterator[str]:
         yield f"throughput is {found:g}"
     if not abs(found - wanted) <= _ROUNDING * wanted:
         yield f"throughput is {found:g}, but rho phi s L U is {wanted:g}"
+
+
+def _energy(scene: Scene, result: Result) -> Iterator[str]:
+    """Power is what the pressing force does at its angle, and what idling takes; energy is power over throughput."""
+    rolls, names = scene.rolls, ("pressing_force", "force_angle", "power", "torque", "specific_energy", "throughput")
+    force, angle, power, torque, energy, throughput = (float(result[name]) for name in names)
+    idle = rolls.idle_torque * rolls.speed
+    by_force = 2 * force * rolls.surface_speed * math.sin(angle)
+    if angle < math.pi / 2 * (1 - _ROUNDING) and not _close(power, by_force + idle):
+        yield f"power is {power:g}, force and idling take {by_force + idle:g}"
+    if not _close(torque * rolls.speed, power) or not _close(energy * throughput, power):
+        yield f"power is {power:g}, but torque {torque:g}, specific energy {energy:g}"
+    wanted, area = rolls.specific_pressing_force, rolls.diameter * rolls.width
+    if wanted is not None and abs(force / area / wanted - 1) > _CARRIED:
+        yield f"the gap carries {force / area:g} Pa of the {wanted:g} wanted"
+
+
+def _close(one: float, other: float) -> bool:
+    """Return whether two figures that float32 holds are the same to a few roundings; what is too small for it is."""
+    return abs(one - other) <= 16 * _ROUNDING * max(abs(one), abs(other)) + _TINY
 
 
 def _sizes(scene: Scene, result: Result) -> Iterator[str]:
@@ -266,6 +292,7 @@ INVARIANTS: dict[str, Callable[[Scene, Result], Iterator[str]]] = {
     "shear within its limit": _shear_ratio,
     "solid fraction within its limits": _solid_fraction,
     "throughput": _throughput,
+    "energy": _energy,
     "sizes positive and never growing": _sizes,
     "never coarser than the feed": _never_coarser,
     "distributions rise from 0 to 1": _distributions,
@@ -292,6 +319,8 @@ def nothing_can_break(scene: Scene, result: Result) -> bool:
     stresses = result["pressure"].astype(float)
     if scene.strength.stress == "major":
         stresses = stresses + 2 / 3 * result["shear_stress"]
+    if math.isfinite(scene.strength.scatter):
+        return False  # any grain may be weak
     largest = stresses[result["volumetric_strain_rate"] > 0].max(initial=0.0)
     if largest == 0:
         return not result["pressure"].any()

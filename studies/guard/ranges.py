@@ -12,36 +12,23 @@ import numpy as np
 from pydantic import ValidationError
 
 from hpgr import cost
-from hpgr.fields import Frozen, kinds_of, parts_of
+from hpgr.bed import machine
+from hpgr.fields import Frozen, kinds_of, parts_of, values_of
 from hpgr.scene import Scene
 
 _DECADES = 9  # over which values are drawn where a range begins at 0 or has no upper end
 
 
 class Range(NamedTuple):
-    """Declared range of a numeric field.
-
-    Attributes
-    ----------
-    low, high : float
-        Lower and upper end; `high` is inf where none is declared.
-    low_open, high_open : bool
-        Whether the end itself is refused.
-    whole : bool
-        Whether only whole numbers are allowed.
-    infinite : bool
-        Whether inf is a value with a meaning.
-    optional : bool
-        Whether the field may be left out.
-    """
+    """Declared range of a numeric field; the ends are refused where they are open."""
 
     low: float
-    high: float
+    high: float  # inf where none is declared
     low_open: bool
     high_open: bool
-    whole: bool
-    infinite: bool
-    optional: bool
+    whole: bool  # only whole numbers are allowed
+    infinite: bool  # inf is a value with a meaning
+    optional: bool  # the field may be left out
 
     def ends(self) -> list[float]:
         """Return the lowest and highest value that are allowed, and inf where it is."""
@@ -148,39 +135,40 @@ def _range(field: Any) -> Range | None:
 
 
 def draw(base: Scene, generator: np.random.Generator, exchange: bool, most_seconds: float) -> dict[str, Any]:
-    """Return the values of a random scene by dotted name, for `base.with_values`.
+    """Return the values of a random scene by dotted name, for `base.with_values`, predicted to cost `most_seconds`.
 
     Half of the scenes draw every field over its whole range; the other half draw a few, which leaves more of the
-    machine working. Gaps and grain sizes are drawn so that they fit each other, or hardly any scene would run;
-    the resolution is small, and stress steps and points are halved until the predicted cost is low enough.
-
-    Parameters
-    ----------
-    base : Scene
-        Gives the fields that are not drawn.
-    generator : numpy.random.Generator
-        Source of all choices.
-    exchange : bool
-        Whether the scene has exchange.
-    most_seconds : float
-        Most that a run may cost by `hpgr.cost.predict`.
+    machine working. Gaps and grain sizes are drawn so that they fit each other, or hardly any scene would run; once
+    in four the gap floats under a force near that which the drawn gap carries. The resolution is small, or, once in
+    ten, one of its fields is drawn over its whole range too; counts are then halved until the cost is low enough.
     """
     chance = 1.0 if generator.random() < 0.5 else 0.15
-    width = not exchange and generator.random() < 0.5
+    width, forced = not exchange and generator.random() < 0.5, generator.random() < 0.25
     drawn: dict[str, Any] = {}
     for section in ("rolls", "bed", "flow", "elasticity", "strength", "fragments"):
         drawn |= _draw_section(section, chance, generator)
     for section, wanted in (("exchange", exchange), ("roll_width", width)):
         drawn |= _draw_section(section, chance, generator) or {section: {}} if wanted else {section: None}
-    drawn |= _draw_gaps(drawn.get("rolls.diameter", base.rolls.diameter), generator)
+    drawn |= _draw_gaps(drawn.get("rolls.diameter", base.rolls.diameter), 1e-3 if forced else 1e-6, generator)
     names = ("bed.feed_solid_fraction", "bed.max_solid_fraction")  # the feed's is at most the largest
     fractions = [drawn.get(name, getattr(base.bed, name.partition(".")[2])) for name in names]
     drawn |= dict(zip(names, sorted(fractions), strict=True))
-    drawn |= _draw_feed(drawn.get("rolls.entry_gap", base.rolls.entry_gap), generator)
+    drawn |= _draw_feed(drawn["rolls.entry_gap"], generator)
     drawn |= _draw_resolution(exchange, width, generator)
     if drawn["flow.kind"] == "nip":
         drawn |= _draw_nip(drawn.get("rolls.diameter", base.rolls.diameter), drawn, generator)
-    return _affordable(base, drawn, most_seconds)
+    drawn = _affordable(base, drawn, most_seconds)
+    return near_force(base, drawn, _log_uniform(0.5, 2, generator)) if forced else drawn
+
+
+def near_force(base: Scene, values: dict[str, Any], factor: float) -> dict[str, Any]:
+    """Return the values with `factor` times the pressing force that the scene's own gap carries, if it carries any."""
+    try:
+        force = factor * machine.specific_pressing_force(base.with_values(values))
+    except ValueError:
+        return values  # it will not be run
+    known = numeric_fields()["rolls.specific_pressing_force"]
+    return values | ({"rolls.specific_pressing_force": force} if known.low <= force <= known.high else {})
 
 
 def _draw_section(section: str, chance: float, generator: np.random.Generator) -> dict[str, Any]:
@@ -212,10 +200,10 @@ def _log_uniform(low: float, high: float, generator: np.random.Generator) -> flo
     return low * (high / low) ** generator.random()
 
 
-def _draw_gaps(diameter: float, generator: np.random.Generator) -> dict[str, Any]:
-    """Return a gap and an entry gap that the rolls allow, once in fifty equal."""
+def _draw_gaps(diameter: float, narrowest: float, generator: np.random.Generator) -> dict[str, Any]:
+    """Return a gap, from `narrowest` diameters, and an entry gap that the rolls allow, once in fifty equal."""
     known = numeric_fields()["rolls.gap"]
-    gap = max(diameter * _log_uniform(1e-6, 1.0, generator), known.low)
+    gap = max(diameter * _log_uniform(narrowest, 1.0, generator), known.low)
     rise = 0.0 if generator.random() < 0.02 else diameter * _log_uniform(1e-4, 0.5, generator)
     return {"rolls.gap": gap, "rolls.entry_gap": min(gap + rise, known.high)}
 
@@ -245,25 +233,30 @@ def _draw_feed(entry_gap: float, generator: np.random.Generator) -> dict[str, An
 def _draw_resolution(exchange: bool, width: bool, generator: np.random.Generator) -> dict[str, Any]:
     records = ("product",) if width else choices()["resolution.record"]
     few = generator.integers(0, 4)
-    return {
+    drawn = {
         "resolution.streamlines": int(generator.integers(1, 5 if exchange else 7)),
         "resolution.points": int(generator.integers(2, 41 if exchange else 101)),
         "resolution.cells": int(few if generator.random() < 0.3 else generator.integers(4, 65 if exchange else 201)),
         "resolution.snapshots": int(generator.integers(1, 4)),
         "resolution.record": records[generator.integers(len(records))],
     } | ({"exchange.interval": int(generator.integers(1, 6))} if exchange else {})
+    if generator.random() < 0.1:
+        counted = [name for name in drawn if name in numeric_fields()]
+        name = counted[generator.integers(len(counted))]
+        drawn[name] = numeric_fields()[name].draw(generator)
+    return drawn
 
 
 def _affordable(base: Scene, values: dict[str, Any], most_seconds: float) -> dict[str, Any]:
-    """Return the values with stress steps, then points, halved until the predicted cost is low enough."""
+    """Return the values with the largest count halved until the predicted cost is low enough."""
+    counted = [name for name, known in numeric_fields().items() if known.whole]
     while True:
         try:
             scene = base.with_values(values)
         except ValidationError:
             return values  # it will not be run
-        if cost.predict(scene).seconds <= most_seconds or scene.resolution.points <= 2:
+        known = values_of(scene)
+        largest = max((name for name in counted if name in known), key=known.get)
+        if cost.predict(scene).seconds <= most_seconds or known[largest] <= 4:
             return values
-        name, count = "elasticity.substeps", scene.elasticity.substeps
-        if count == 1:
-            name, count = "resolution.points", scene.resolution.points
-        values = values | {name: count // 2}
+        values = values | {largest: known[largest] // 2}
