@@ -292,7 +292,7 @@ def test_text_with_units_numbers_and_numpy_scalars_mean_the_same():
             "got '60 kg'; not a quantity in mm: its unit 'kg' measures something else; give a value",
         ),
         ("rolls.gap", "19 mm)", "not a number and a unit"),
-        ("rolls.speed", "0.67 m/s", "not a rate of turning"),
+        ("rolls.speed", "0.67 m/min", "not a rate of turning"),
         ("strength.cushioning", "1", "must be a number, not text"),
         ("rolls.gap", "inf mm", "must be finite"),
         ("elasticity.exponent", "inf", "must be finite"),
