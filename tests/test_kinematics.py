@@ -241,25 +241,27 @@ def test_volumetric_strain_is_the_logarithm_of_the_density_ratio(values):
     assert order == pytest.approx(-2, abs=0.25)  # trapezoid rule
 
 
-def test_force_does_not_jump_as_the_nip_crosses_a_point():
-    """The number of points below the nip changes by one between two gaps 1e-13 apart; force and strain do not."""
+@pytest.mark.parametrize("values", [NIPS["pilot"], {}], ids=["nip", "power"])
+def test_force_does_not_jump_as_the_onset_of_compaction_crosses_a_point(values):
+    """The number of points that compact changes between two gaps 1e-13 apart; force and strain do not."""
+    gap = paper(values).rolls.gap
 
-    def below(gap):
-        scene = paper(NIPS["pilot"] | {"rolls.gap": gap, "resolution.points": 41})
-        bed, motion, strains = moved(scene, 41, xi=(0.5,))
-        return np.count_nonzero(motion.y <= nip_of(scene, bed)), scene, strains.volumetric.sum()
+    def compacting(gap):
+        scene = paper(values | {"rolls.gap": gap, "resolution.points": 41})
+        _, motion, strains = moved(scene, 41, xi=(1.0,))
+        return np.count_nonzero(motion.volumetric_rate > 0), scene, strains.volumetric.sum()
 
-    gaps = np.linspace(0.020, 0.030, 60)
-    counts = [below(gap)[0] for gap in gaps]
+    gaps = gap * np.linspace(0.4, 2.0, 60)
+    counts = [compacting(gap)[0] for gap in gaps]
     crossings = np.flatnonzero(np.diff(counts))
     assert crossings.size >= 2
     for k in crossings[:3]:
         low, high = gaps[k], gaps[k + 1]
         while high - low > 1e-13:
             middle = (low + high) / 2
-            low, high = (middle, high) if below(middle)[0] == counts[k] else (low, middle)
-        (first, scene, strain), (second, other, others) = below(low), below(high)
+            low, high = (middle, high) if compacting(middle)[0] == counts[k] else (low, middle)
+        (first, scene, strain), (second, other, others) = compacting(low), compacting(high)
         assert first != second
-        assert others == pytest.approx(strain, rel=1e-7)
+        assert others == pytest.approx(strain, rel=1e-6)
         force = machine.specific_pressing_force(scene)
         assert machine.specific_pressing_force(other) == pytest.approx(force, rel=1e-6)

@@ -5,13 +5,15 @@ import re
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.integrate import cumulative_simpson, simpson
 from support import paper
 
 from hpgr import Scene, operating_gap, presets, simulate
 from hpgr.bed import kernels, kinematics, machine, stress
 from hpgr.bed.loaded import Beds, Pressed, inputs_of, load_bed
-from hpgr.laws.flow import NipFlow
+from hpgr.laws.flow import NipFlow, PowerFlow
 from hpgr.results import metrics
 
 SMALL = {"resolution.cells": 0, "resolution.points": 101, "resolution.streamlines": 4, "resolution.record": "product"}
@@ -340,5 +342,54 @@ def test_bed_too_low_for_any_gap_is_refused_with_the_entry_gap_it_needs():
 def test_a_floated_gap_stays_below_the_steepest_entry():
     """At an entry angle of 60 degrees a scene is refused, so no gap may float there."""
     high = {"rolls.entry_gap": 1.15, "rolls.gap": 0.055, "rolls.specific_pressing_force": 6e5}
-    with pytest.raises(ValueError, match=r"reachable .* below which the bed would begin above 60 degrees"):
+    with pytest.raises(ValueError, match=r"reachable .* below which .*the bed would begin above 60 degrees"):
         machine.float_gap(industrial(high))
+
+
+COARSE = {"flow": {"kind": "power", "exponent": 2.0}, "bed.max_solid_fraction": 1.0, "resolution.points": 100}
+
+
+@pytest.mark.parametrize("force", [6e5, 1.2e6, 2e6, 3e6])
+def test_gap_of_a_coarse_bed_carries_the_force(force):
+    """One gap carried every one of these where strain began at a point, whatever the force there."""
+    found = machine.float_gap(industrial(COARSE | {"rolls.specific_pressing_force": force}))
+    assert machine.specific_pressing_force(found) == pytest.approx(force, rel=1e-6)
+
+
+@given(
+    st.sampled_from(["paper", "khd_pilot", "industrial"]),
+    st.one_of(
+        st.builds(PowerFlow, exponent=st.floats(0.1, 5), entry_fraction=st.sampled_from([1e-4, 0.02, 0.5])),
+        st.builds(NipFlow, nip_angle=st.floats(0.02, 1.0)),
+    ),
+    st.floats(0.8, 8),
+    st.sampled_from([-0.5, 0.0, 0.5, 4.0]),
+    st.integers(2, 120),
+    st.floats(1e4, 1e8),
+)
+def test_a_floated_scene_carries_its_force_and_is_valid_or_is_refused(preset, flow, higher, c, points, force):
+    scene = Scene.preset(preset)
+    values = {
+        "flow": flow,
+        "elasticity.exponent": c,
+        "resolution.points": points,
+        "feed": {"kind": "single", "size": 1e-3},
+    }
+    values |= {"rolls.entry_gap": higher * scene.rolls.entry_gap, "rolls.specific_pressing_force": force}
+    try:
+        found = machine.float_gap(scene.with_values(values))
+    except ValueError as error:
+        assert re.search(r"rolls\.|flow\.", str(error))  # noqa: PT017 - no other refusal
+        return
+    assert machine.specific_pressing_force(found) == pytest.approx(force, rel=1e-6)
+    assert Scene.model_validate_json(found.model_dump_json()) == found
+
+
+def test_a_force_that_jumps_past_what_is_wanted_is_refused():
+    """Without a limit of shear (c <= 0) the bed has some as soon as a point compacts."""
+    loose = {"elasticity.exponent": 0.0, "resolution.points": 60, "rolls.entry_gap": 2.0}
+    scene = paper(loose | {"rolls.specific_pressing_force": 1e5, "flow.exponent": 1.0})
+    with pytest.raises(
+        ValueError, match=r"got .*; must lie outside .* between which the force jumps at a gap of .* mm"
+    ):
+        machine.float_gap(scene)

@@ -169,34 +169,28 @@ def _march_back(line, flow, edges, duration, places):
 
 
 @_compiled
-def _past_nip(line, y, way):
-    """Return how much of the step that crosses the nip and ends at the height y, `way` long, lies past the nip."""
-    # there |v| = U, so time is arc length over U; the chord of a step is 1e-6 short of its arc
-    outer, _, _ = _shape(line, y)
-    nip_outer, _, _ = _shape(line, line.nip)
-    return min(math.hypot(line.xi * outer - line.xi * nip_outer, y - line.nip) / way, 1.0) if y < line.nip else 0.0
-
-
-@_compiled
-def _strain(line, flow, surface_speed, time_step, y, volumetric_rate, shear_rate, volumetric, shear):
+def _strain(line, flow, unit_time, time_step, places, y, volumetric_rate, shear_rate, volumetric, shear):
     """Fill the strains of the step that ends at each point, by the trapezoid rule.
 
-    They count from the onset of compaction: the first point that compacts, or the nip. Of the step with the nip only
-    what lies past it counts, with the rates just past it.
+    They count from the onset of compaction, and of the step with the onset only what lies past it does, lest the
+    force jump as a point crosses it: past the nip, with the rates there; else past where the rate, linear between
+    two points, turns from dilation.
     """
     volumetric[0] = shear[0] = 0.0
-    begun = flow.nip_angle > 0
+    begun, nip = flow.nip_angle > 0, line.nip / line.height
     for j in range(1, y.size):
-        begun = begun or volumetric_rate[j - 1] > 0
-        past = time_step / 2 if begun else 0.0
-        first_volumetric, first_shear = volumetric_rate[j - 1], shear_rate[j - 1]
-        if flow.nip_angle > 0 and y[j - 1] > line.nip:
-            past *= _past_nip(line, y[j], surface_speed * time_step)
-            _, first_volumetric, first_shear = _rates(line, flow, line.nip, 1 - line.nip / line.height)
-            first_volumetric /= line.height / surface_speed
-            first_shear /= line.height / surface_speed
-        volumetric[j] = (volumetric_rate[j] + first_volumetric) * past
-        shear[j] = (shear_rate[j] + first_shear) * past
+        past, first_volumetric, first_shear = time_step, volumetric_rate[j - 1], shear_rate[j - 1]
+        begun = begun or first_volumetric > 0
+        if not begun:
+            share = volumetric_rate[j] / (volumetric_rate[j] - first_volumetric) if volumetric_rate[j] > 0 else 0.0
+            first_volumetric, first_shear = 0.0, shear_rate[j] + share * (first_shear - shear_rate[j])
+            past = share * time_step
+        elif flow.nip_angle > 0 and y[j - 1] > line.nip:
+            past = unit_time * _travel(line, flow, places[j], nip - places[j]) if y[j] < line.nip else 0.0
+            _, first_volumetric, first_shear = _rates(line, flow, line.nip, 1 - nip)
+            first_volumetric, first_shear = first_volumetric / unit_time, first_shear / unit_time
+        volumetric[j] = (volumetric_rate[j] + first_volumetric) * past / 2
+        shear[j] = (shear_rate[j] + first_shear) * past / 2
 
 
 @_compiled
@@ -224,7 +218,7 @@ def lay(bed, flow, surface_speed, y, speed, volumetric_rate, shear_rate, volumet
             if j > 0:
                 closest = min(closest, y[i, j - 1] - y[i, j])
         rates = volumetric_rate[i], shear_rate[i]
-        _strain(line, flow, surface_speed, time_step, y[i], rates[0], rates[1], volumetric[i], shear[i])
+        _strain(line, flow, unit_time, time_step, places, y[i], rates[0], rates[1], volumetric[i], shear[i])
     return time_step, closest
 
 

@@ -131,12 +131,12 @@ def _press(walled: Geometry, flow: FlowConstants, motion: Kinematics, strains: S
     if walled.height == 0:
         return Pressed(0.0, 0.0, 0.0)
     pressure, shear_stress = state.pressure, state.shear_stress
-    compacting = strains.volumetric[-1] > 0
-    onset = flow.nip_angle or math.asin(motion.y[-1, max(int(compacting.argmax()) - 1, 0)] / walled.radius)
+    first = int((motion.volumetric_rate[-1] > 0).argmax())
+    onset = flow.nip_angle or math.asin(motion.y[-1, first] / walled.radius)
     return Pressed(
         kernels.wall_force(walled, flow, motion.y[-1], pressure[-1], shear_stress[-1]),
         kernels.power(walled, flow, motion.y, motion.speed, *strains, pressure, shear_stress),
-        onset if compacting.any() else 0.0,
+        onset if (strains.volumetric[-1] > 0).any() else 0.0,
     )
 
 

@@ -17,6 +17,8 @@ from hpgr.scene import LEAST_GAP, STEEPEST_ENTRY, Scene
 _NARROWEST = 1e-4  # gap over diameter below which no operating gap is looked for
 _GAP_PRECISION = 1e-9  # relative, of an operating gap
 _NO_FORCE = 1e-6  # of the wanted force; less counts as this much
+_CARRIED = 1e-6  # relative error of the force at the gap found
+_TRIED = 65  # gaps among which the bed that presses most is looked for
 
 
 class Performance(NamedTuple):
@@ -152,29 +154,41 @@ def _gap_carrying(inputs: BedInputs, wanted: float, mean_pressure: float) -> flo
 
     narrow, below = _narrowest(inputs)
     wide = inputs.flow.widest_gap(inputs.diameter, inputs.entry_gap)
-
-    def force(gap: float) -> float:
-        return _force_over_diameter(inputs._replace(gap=gap)) * mean_pressure
-
-    @cache
-    def excess(log_gap: float) -> float:  # nearly straight in logs; without any force it is far below
-        return math.log(max(force(math.exp(log_gap)) / wanted, _NO_FORCE))
-
     if narrow >= wide:
         raise ValueError(
             f"rolls.entry_gap: got {show(inputs.entry_gap, 'm')}; must be above "
             f"{show(inputs.entry_gap + narrow - wide, 'm')} for the gap to float below it, the narrowest gap being "
             f"{show(narrow, 'm')}, below which {below}; begin the bed higher"
         )
-    ends = math.log(narrow), math.log(wide)
-    if not excess(ends[0]) >= 0 >= excess(ends[1]):
+
+    @cache
+    def force(log_gap: float) -> float:
+        return _force_over_diameter(inputs._replace(gap=math.exp(log_gap))) * mean_pressure
+
+    def excess(log_gap: float) -> float:  # nearly straight in logs; without any force it is far below
+        return math.log(max(force(log_gap) / wanted, _NO_FORCE))
+
+    low, high = math.log(narrow), math.log(wide)
+    if force(low) < wanted:  # a bed so narrow that it lies between points is not pressed
+        low, below = max(np.linspace(low, high, _TRIED).tolist(), key=force), "points are too few, or " + below
+    if not force(low) >= wanted >= force(high):
         raise ValueError(
-            f"rolls.specific_pressing_force: got {show(wanted, 'Pa')}; must lie within the reachable "
-            f"{show(force(wide), 'Pa')} (gap {show(wide, 'm')}) to {show(force(narrow), 'Pa')} (gap "
-            f"{show(narrow, 'm')}, below which {below}); choose a force within, or another bulk modulus, nip angle "
-            "or entry gap"
+            f"{_refused(wanted)} within the reachable {show(force(high), 'Pa')} (gap {show(wide, 'm')}) to "
+            f"{show(force(low), 'Pa')} (gap {show(math.exp(low), 'm')}, below which {below}); choose a force within, "
+            "or another bulk modulus, nip angle or entry gap"
         )
-    return math.exp(brentq(excess, *ends, xtol=_GAP_PRECISION, rtol=4 * np.finfo(float).eps))
+    found = brentq(excess, low, high, xtol=_GAP_PRECISION, rtol=4 * np.finfo(float).eps)
+    if abs(force(found) / wanted - 1) > _CARRIED:
+        jump = [show(force(found + side * _GAP_PRECISION), "Pa") for side in (1, -1)]
+        raise ValueError(
+            f"{_refused(wanted)} outside {jump[0]} to {jump[1]}, between which the force jumps at a gap of "
+            f"{show(math.exp(found), 'm')}; choose a force outside, or elasticity.exponent above 0"
+        )
+    return math.exp(found)
+
+
+def _refused(wanted: float) -> str:
+    return f"rolls.specific_pressing_force: got {show(wanted, 'Pa')}; must lie"
 
 
 def _narrowest(inputs: BedInputs) -> tuple[float, str]:
