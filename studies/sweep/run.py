@@ -221,7 +221,7 @@ def _computed(plan: Plan, client: Any, task: Task, progress: bool) -> Iterator[C
         say(_prediction(plan, workers))
     with progress_bar(total, progress, "cases", "{rate_fmt}, {remaining} left", total - plan.left) as bar:
         for result in dispatched(plan, client, task):
-            yield from plan.settle(result)
+            yield result
             bar.update(total - plan.left - bar.n)
 
 
@@ -292,7 +292,7 @@ def workers_of(client: Any) -> int:
 
 
 def dispatched(plan: Plan, client: Any, task: Task) -> Iterator[CaseResult]:
-    """Yield the result of every case of the plan as it comes in, in no particular order.
+    """Yield the result of every case of the plan as it comes in, computed or read back, in no particular order.
 
     Raises
     ------
@@ -325,7 +325,8 @@ def dispatched(plan: Plan, client: Any, task: Task) -> Iterator[CaseResult]:
                 idle.tell(plan, bool(flying))
                 continue
             batch = flying.pop(future)
-            yield from _settle(future, batch, again)
+            for result in _settle(future, batch, again):
+                yield from plan.settle(result)
             future.release()
             del future
     finally:
