@@ -15,9 +15,11 @@ import pytest
 import xarray as xr
 from support import paper, sized
 
-from studies import runner
-from studies.bench import STATUS
-from studies.sweep import sweep
+from hpgr.results.schema import STATUS
+from studies.gap_sweep import main
+from studies.sweep import run, sweep
+
+pytestmark = pytest.mark.slow
 
 SMALL = {"resolution.streamlines": 2, "resolution.points": 20, "resolution.cells": 16}
 AXES = {"rolls.gap": [0.04 + 0.001 * k for k in range(20)]}
@@ -25,16 +27,16 @@ AXES = {"rolls.gap": [0.04 + 0.001 * k for k in range(20)]}
 # slows every case down, so that a worker can be killed on the way; and one gap kills the process it runs in
 PATCH = """
 import os, time
-from hpgr import pipeline
+import hpgr.run
 
-real = pipeline.crush
+real = hpgr.run.run_scene
 
-def crush(scene, prepared, seed, replicate):
+def run_scene(scene, seed=0, replicate=0, beds=None):
     time.sleep(0.05)
     if scene.rolls.gap == 0.0405: os._exit(7)
-    return real(scene, prepared, seed, replicate)
+    return real(scene, seed, replicate, beds)
 
-pipeline.crush = crush
+hpgr.run.run_scene = run_scene
 """
 
 
@@ -75,10 +77,16 @@ def cluster(tmp_path_factory):
     with contextlib.ExitStack() as stack:
         scheduler = stack.enter_context(
             process(
-                "distributed.cli.dask_scheduler", *common, "--port", "0", "--scheduler-file", str(file), cwd=cwd,
+                "distributed.cli.dask_scheduler",
+                *common,
+                "--port",
+                "0",
+                "--scheduler-file",
+                str(file),
+                cwd=cwd,
                 env=plain,
             )
-        )  # fmt: skip
+        )
         deadline = time.monotonic() + 120
         address = None
         while address is None:
@@ -91,29 +99,44 @@ def cluster(tmp_path_factory):
         second = stack.enter_context(
             process("distributed.cli.dask_worker", address, "--no-nanny", *worker, cwd=cwd, env=env)
         )
-        client = stack.enter_context(Client(address))
+        client = stack.enter_context(Client(address, set_as_default=False))
         client.wait_for_workers(2, timeout=120)
-        yield client, second
+        yield client, second, address
 
 
 def test_case_that_kills_its_worker_is_named(base, cluster):
     """With a timeout cases run in processes of their own: the worker lives on, and only the guilty case is lost."""
-    client, _ = cluster
+    client, *_ = cluster
     axes = {"rolls.gap": [0.04, 0.0405, 0.041]}
     result = sweep(base, axes, replicates=2, client=client, timeout=30.0)
     assert result["status"].values.tolist() == [[0, 0], [STATUS["worker_lost"]] * 2, [0, 0]]
     assert "exit code 7" in result["message"].values[1, 0]
     good = sweep(base, axes, replicates=2)
-    for name in set(good.data_vars) - {"status", "message", "notes"}:
+    for name in set(good.data_vars) - {"status", "message", "diagnostics"}:
         assert np.array_equal(result[name].values[[0, 2]], good[name].values[[0, 2]]), name
     assert len(client.nthreads()) == 2
 
 
+def test_running_scheduler_gives_the_same_bits(cluster, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    command = ["--gap", "40 mm", "1.2 m", "50 mm", "--replicates", "2", "--seed", "5", "--no-plot"]
+    command += ["--cells", "60", "--points", "40", "--streamlines", "3"]
+    address = cluster[-1]
+    assert address.startswith("tcp://127.0.0.1:")
+    assert main([*command, "--scheduler", address, "--out", "far.nc"]) == 1  # the 1.2 m gap is refused
+    assert main([*command, "--out", "near.nc"]) == 1
+    capsys.readouterr()
+    with xr.open_dataset("far.nc") as far, xr.open_dataset("near.nc") as near:
+        assert far["status"].values.tolist() == [[0, 0], [1, 1], [0, 0]]
+        far.attrs["history"] = near.attrs["history"]
+        xr.testing.assert_identical(far.load(), near.load())
+
+
 def test_worker_killed_on_the_way_changes_no_bit(base, cluster, tmp_path):
-    client, victim = cluster
+    client, victim, _ = cluster
     calls = []
 
-    real = runner._settle
+    real = run._settle
 
     def settle(future, batch, again):
         calls.append(len(batch))
@@ -122,7 +145,7 @@ def test_worker_killed_on_the_way_changes_no_bit(base, cluster, tmp_path):
         return real(future, batch, again)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(runner, "_settle", settle)
+        patch.setattr(run, "_settle", settle)
         far = sweep(base, AXES, replicates=sized(4, 2), seed=5, client=client, folder=tmp_path)
     assert victim.wait(10) == -signal.SIGKILL
     assert len(client.nthreads()) == 1
@@ -134,8 +157,8 @@ def test_worker_killed_on_the_way_changes_no_bit(base, cluster, tmp_path):
 
 
 def test_lost_scheduler_is_told_and_finished_cases_are_kept(base, tmp_path):
-    with runner.own_client(1) as client:
-        real, submit = runner._settle, client.submit
+    with run.own_client(1) as client:
+        real, submit = run._settle, client.submit
         calls, sent = [], []
 
         def settle(future, batch, again):
@@ -149,7 +172,7 @@ def test_lost_scheduler_is_told_and_finished_cases_are_kept(base, tmp_path):
             return sent[-1]
 
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(runner, "_settle", settle)
+            patch.setattr(run, "_settle", settle)
             patch.setattr(client, "submit", submit_seen)
             with pytest.raises(ConnectionError, match=r"lost the dask scheduler.*run the same command again"):
                 sweep(base, AXES, client=client, folder=tmp_path)
@@ -166,14 +189,35 @@ def test_dask_jobqueue(base, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONWARNINGS", "ignore")
     with (
         jobqueue.LocalCluster(
-            cores=1, processes=1, memory="2GB", python=sys.executable, interface=None, local_directory=str(tmp_path),
+            cores=1,
+            processes=1,
+            memory="2GB",
+            python=sys.executable,
+            interface=None,
+            local_directory=str(tmp_path),
             scheduler_options={"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"},
             worker_extra_args=["--host", "127.0.0.1"],
         ) as cluster,
-        Client(cluster) as client,
-    ):  # fmt: skip
+        Client(cluster, set_as_default=False) as client,
+    ):
         cluster.scale(jobs=2)
         client.wait_for_workers(1, timeout=120)
         far = sweep(base, {"rolls.gap": [0.04, 0.05]}, replicates=2, client=client)
     xr.testing.assert_identical(far, sweep(base, {"rolls.gap": [0.04, 0.05]}, replicates=2))
     gc.collect()  # dask-jobqueue leaves processes and pipes to the collector, which warns of them
+
+
+@pytest.mark.parametrize("timeout", [None, 60.0])
+def test_nothing_listens_beyond_loopback(base, monkeypatch, timeout, tmp_path):
+    seen = []
+    real = run._settle
+
+    def settle(*arguments):
+        for process in (psutil.Process(), *psutil.Process().children(recursive=True)):
+            seen.extend(one for one in process.net_connections("inet") if one.status == psutil.CONN_LISTEN)
+        return real(*arguments)
+
+    monkeypatch.setattr(run, "_settle", settle)
+    sweep(base, {"rolls.gap": [0.04]}, folder=tmp_path, timeout=timeout)
+    assert seen  # the dashboards, or the test looks at nothing
+    assert {one.laddr.ip for one in seen} <= {"127.0.0.1", "::1"}

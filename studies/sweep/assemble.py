@@ -77,7 +77,9 @@ def _labelled(space: Space, values: dict[str, Any], attrs: dict[str, Any]) -> xr
     for name, entry in (schema.COORDINATES | schema.VARIABLES | schema.SWEEP).items():
         if name not in space.dims and not _common(name):
             own[name] = entry._replace(dims=(*space.dims, *entry.dims))
-    return schema.to_dataset(values, attrs, own).set_coords(list(map(dim_of, space.fields)))
+    # what a mean over replicates has no sense of is a coordinate, which xarray leaves out of it
+    apart = [name for name in (*schema.SWEEP, "flags") if name in values]
+    return schema.to_dataset(values, attrs, own).set_coords([*map(dim_of, space.fields), *apart])
 
 
 def _common(name: str) -> bool:

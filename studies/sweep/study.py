@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import ValidationError
 
-from hpgr.cost import predict
 from hpgr.fields import faults_of, show, unit_shown
 from hpgr.scene import Scene, field_info
 from studies import command as line
@@ -201,25 +200,15 @@ def _swept(scene: Scene, space: dict[Any, Any], options: Options, folder: Path) 
 
 
 def _report(field: str, caption: str, result: "xr.Dataset", sieve: float) -> Report:
-    from studies.show import report
+    from studies.show import plant, report
 
     lost = report.lost_cases(result)
     if not report.any_result(result):
         return Report(faults=[*lost, "no case holds a result; nothing was written"])
     sayings = [*report.change(result, field), caption]
-
-    def drawn() -> Any:
-        from studies.show.plots import maps, sweeps
-
-        words = "\n".join(sayings)
-        return (
-            maps.maps_figure(result, sieve, words)
-            if maps.is_map(result)
-            else sweeps.sweep_figure(result, field, sieve, words)
-        )
-
     lines = [report.table(result, sieve), *report.remarks(result), *sayings]
-    return Report(lines, [result, line.figure(drawn)], lost)
+    drawn = line.figure(lambda: plant.picture(result, field, sieve, "\n".join(sayings)))
+    return Report(lines, [result, drawn], lost)
 
 
 def _headings(dim: str, axis: Axis) -> list[str]:
@@ -236,6 +225,7 @@ def _place(axis: Axis, index: int) -> list[str]:
 
 def _cases(scene: Scene, space: Space, options: Options, folder: Path) -> list[str]:
     """Return in words what a sweep would run: its operating points, with predicted memory and time."""
+    from hpgr.cost import predict
     from studies.show.report import aligned
     from studies.sweep.cases import code_version, finished
 
