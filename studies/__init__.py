@@ -1,17 +1,18 @@
 """Parametric studies: scenes fanned out over dask, summaries in NetCDF, figures.
 
-`studies.open_cases(folder)` opens the cases that a sweep has recorded whole. It loads on first use: a study's `--help`
-needs no xarray.
+`studies.open_cases(folder)` opens the cases that a sweep has recorded whole, `studies.optimise(scene, ...)` looks for
+the best operating point, `studies.close_circuit(scene, ...)` returns what is too coarse to the feed. They load on first
+use: a study's `--help` needs no xarray.
 """
 
+from importlib import import_module
 from typing import Any
 
-__all__ = ["open_cases"]
+_HOMES = {"open_cases": "sweep.assemble", "optimise": "optimum", "close_circuit": "circuit"}
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
+    if name not in _HOMES:
         raise AttributeError(f"module 'studies' has no attribute {name!r}")
-    from studies.sweep.assemble import open_cases
-
-    return open_cases
+    return getattr(import_module(f"studies.{_HOMES[name]}"), name)

@@ -22,9 +22,10 @@ from studies.sweep.space import ends_of, field_of
 if TYPE_CHECKING:
     import matplotlib.figure
 
-# A study's files name the command that made them: in the history, a PNG's "Source", a GIF's comment, a page's generator
+# A study's files name the command that made them: in the history, a PNG's "Source", a GIF's comment, a page's
+# generator, the first line of a scene file
 _PREFIX = re.compile(r"python -m studies\.\w+")
-_MARK = re.compile(rb"(?:Source\0+|!\xfe.|\"generator\" content=\")(python -m studies\.\w+)", re.DOTALL)
+_MARK = re.compile(rb"(?:\A# |Source\0+|!\xfe.|\"generator\" content=\")(python -m studies\.\w+)", re.DOTALL)
 _MARK_WITHIN = 1 << 16  # bytes from the beginning
 
 Part = "xr.Dataset | Callable[[Path, str], object]"
@@ -157,6 +158,15 @@ def varied(text: str) -> tuple[str, list | tuple]:
     last = int(count) - 1
     values = [float(f"{low + k * (high - low) / last:.12g}") for k in range(last + 1)]
     return field, [round(value) for value in values] if isinstance(low, int) and isinstance(high, int) else values
+
+
+def ranges(texts: Sequence[str]) -> dict[str, tuple]:
+    """Return the range of each field that `--vary` is given for; values in place of a range are refused."""
+    found = dict(map(varied, texts))
+    listed = [name for name, values in found.items() if isinstance(values, list)]
+    if listed or not found:
+        raise ValueError(f"--vary: got {', '.join(listed) or 'nothing'}; must be ranges; such as 'gap=40 mm..60 mm'")
+    return found
 
 
 def _number(field: str, text: str) -> Any:

@@ -4,7 +4,6 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hpgr.fields import parse, show, unit_shown
-from hpgr.results import schema
 from hpgr.scene import Scene
 
 if TYPE_CHECKING:
@@ -24,7 +23,7 @@ class Quantity(NamedTuple):
     unit : str
         SI.
     words : str
-        What it is called.
+        What it is called, by which `quantity_of` finds it.
     sieve : float, optional
         Sieve, m, of a mass fraction passing.
     """
@@ -43,6 +42,11 @@ class Quantity(NamedTuple):
     def shown(self) -> tuple[str, float]:
         """The unit that it is shown in, and how many of it make one SI unit."""
         return ("%", 100.0) if self.sieve is not None else unit_shown(self.unit)
+
+    @property
+    def plain(self) -> str:
+        """The words as the name of a variable."""
+        return self.words.replace(" ", "_").replace(".", "_")
 
     @property
     def label(self) -> str:
@@ -83,6 +87,8 @@ def quantity_of(name: str) -> Quantity:
     ValueError
         If a run has none of that name.
     """
+    from hpgr.results import schema  # late: `--help` does without
+
     first, _, size = name.strip().partition(" ")
     if first == _PASSING and size:
         sieve = parse(size, "m")
@@ -93,7 +99,8 @@ def quantity_of(name: str) -> Quantity:
     if entry is None or entry.dims or variable == "flags":
         known = [one for one, entry in schema.VARIABLES.items() if not entry.dims and entry.units != "1"]
         raise ValueError(f"a run has no figure {name!r}; give 'passing 6 mm', or one of {', '.join(known)}")
-    return Quantity(variable, entry.units, entry.long_name.partition(",")[0])
+    words = {"p50_total": "P50", "p80_total": "P80"}.get(variable, variable.replace("_", " "))
+    return Quantity(variable, entry.units, words)
 
 
 def with_sieves(scene: Scene, quantities: Iterable[Quantity]) -> Scene:

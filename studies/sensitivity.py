@@ -9,13 +9,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
+
 from hpgr.scene import Scene, field_info
 from studies import command as line
 from studies.command import Report, shown_as
+from studies.quantities import quantity_of, refuse_lost, with_sieves
 from studies.sweep.space import between, ends_of, field_of, sobol_points
 
 if TYPE_CHECKING:
-    import numpy as np
     import xarray as xr
 
 FIGURES = ("p80", "throughput", "specific_energy", "peak_pressure")  # beside the percent below a sieve
@@ -48,7 +50,7 @@ class Options:
     overwrite: line.Overwrite = False
 
 
-def indices(function: Callable[["np.ndarray"], "np.ndarray"], fields: int, count: int, seed: int = 0) -> "np.ndarray":
+def indices(function: Callable[[np.ndarray], np.ndarray], fields: int, count: int, seed: int = 0) -> np.ndarray:
     """Return Sobol indices of the figures of a function on the unit cube, with bootstrapped 95 % intervals.
 
     Parameters
@@ -68,8 +70,6 @@ def indices(function: Callable[["np.ndarray"], "np.ndarray"], fields: int, count
         (order, estimate, figure, field): first order and total; value, low and high. NaN where a figure is the same
         everywhere.
     """
-    import numpy as np
-
     both = sobol_points(2 * fields, count, seed)
     one, other = both[:, :fields], both[:, fields:]
     crossed = np.repeat(one[None], fields, axis=0)
@@ -87,9 +87,8 @@ def indices(function: Callable[["np.ndarray"], "np.ndarray"], fields: int, count
     return found
 
 
-def _sobol(values: "np.ndarray") -> "np.ndarray":
+def _sobol(values: np.ndarray) -> np.ndarray:
     """Return (order, figure, field) indices of values (figure, design, point)."""
-    import numpy as np
     from scipy.stats import sobol_indices
 
     constant = np.ptp(values, axis=(1, 2), keepdims=True) == 0
@@ -144,10 +143,7 @@ def sensitivity(
     >>> float(found["total_order"].sel(field="rolls.speed")[0])
     0.0
     """
-    import numpy as np
-
     from hpgr.results import schema
-    from studies.quantities import quantity_of, refuse_lost, with_sieves
     from studies.sweep import sweep
 
     if count < 4 or count & (count - 1):
@@ -175,10 +171,8 @@ def sensitivity(
     return schema.to_dataset(values, attrs, own)
 
 
-def _rows(over: Any) -> tuple[tuple[str, ...], Callable[["np.ndarray"], list[tuple]]]:
+def _rows(over: Any) -> tuple[tuple[str, ...], Callable[[np.ndarray], list[tuple]]]:
     """Return the fields, and what makes rows of their values of points (point, field) of the unit cube."""
-    import numpy as np
-
     given = {field_of(name): values for name, values in over.items()}
     if not given:
         raise ValueError("over: got no fields; give ranges; such as {'gap': ('40 mm', '60 mm')}")
@@ -203,8 +197,6 @@ def _rows(over: Any) -> tuple[tuple[str, ...], Callable[["np.ndarray"], list[tup
 
 def table(result: "xr.Dataset") -> str:
     """Return the indices as text, the fields of each figure in order of what they matter."""
-    import numpy as np
-
     from studies.show.report import aligned
 
     rows = []
@@ -225,10 +217,7 @@ def table(result: "xr.Dataset") -> str:
 @line.command("sensitivity", __doc__)
 def main(options: Options) -> Report:
     """Write the indices of the command line's ranges."""
-    ranges: dict[str, Any] = dict(line.varied(text) for text in options.vary)
-    listed = next((name for name, values in ranges.items() if isinstance(values, list)), None)
-    if listed is not None or not (ranges or options.posterior):
-        raise ValueError(f"--vary: got {listed or 'nothing'}; must be ranges, lo..hi; such as 'gap=40 mm..60 mm'")
+    ranges: dict[str, Any] = line.ranges(options.vary) if options.vary or not options.posterior else {}
     if options.posterior is not None:
         from studies.sweep.netcdf import open_result
 
