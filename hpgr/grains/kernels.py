@@ -23,10 +23,11 @@ from numba import config, njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from hpgr.laws.fragments import POWER_LAW
+from hpgr.laws.fragments import HELD, POWER_LAW
 from hpgr.laws.strength import SIZE_EFFECT
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
+_inlined = njit(cache=True, nogil=True, error_model="numpy", forceinline=True)  # handing arrays over costs as much
 
 BLOCK = 16  # cells; as many as the vectors below
 DENSE = 1 / 64  # swap probability of an edge from which deciding every cell is cheaper than skipping
@@ -62,6 +63,8 @@ class Parcels(NamedTuple):
 
     sizes: np.ndarray  # float32 (cell + 2,), m
     streams: np.ndarray  # uint64 (cell + 2,), state of each cell's random stream
+    weakness: np.ndarray  # float32 (cell + 2,), what a grain's own strength makes of its effective size; (0,): 1
+    unshielded: np.ndarray  # float32 (cell + 2,), bounds of cells that nothing is known of but themselves
     bounds: np.ndarray  # float32 (block x BLOCK + 2,), upper bounds of effective size over s_m
     block_bounds: np.ndarray  # float32 (block, to the next BLOCK), the largest in each block
 
@@ -86,8 +89,10 @@ class Work(NamedTuple):
 
     active: np.ndarray  # uint32 (block,)
     places: np.ndarray  # uint32 (candidate,)
-    sizes: np.ndarray  # float32
-    totals: np.ndarray  # float64, size and those of both neighbours, m
+    sizes: np.ndarray  # float64, m; then the fragment ratios
+    totals: np.ndarray  # float64, size and those of both neighbours, m; then exponents
+    ratios: np.ndarray  # float64, effective size over s_m without neighbours; then work space of `_raise`
+    states: np.ndarray  # uint64, of the streams
     bounds: np.ndarray  # float32
     breaks: np.ndarray  # uint8
     unsure: np.ndarray  # uint8
@@ -275,8 +280,65 @@ def classify(sizes, slots, sieves, classes):
 # --- crushing -----------------------------------------------------------------------------------------------
 
 
+# Powers in plain arithmetic, which unlike calls becomes vectors (40 -> 3 ns a value) and has the same bits everywhere,
+# to about 1e-13: `_split`, `_exponentiate` and `_join` make v^e = 2^(e log2 v) of values v > 0, one loop each.
+
+
+@_inlined
+def _split(count, bits, powers):
+    """Split numbers, given by their bits, into mantissas between sqrt(1/2) and sqrt(2) and powers of 2."""
+    for k in range(count):
+        power = (bits[k] - np.int64(0x3FE6A09E667F3BCD)) >> np.int64(52)
+        bits[k] -= power << np.int64(52)
+        powers[k] = power
+
+
+@_inlined
+def _exponentiate(count, values, exponents, powers):
+    """Raise split numbers: log2 by artanh of the mantissa, 2^r by its series up to r = 1/2."""
+    for k in range(count):
+        z = (values[k] - 1.0) / (values[k] + 1.0)
+        y = z * z
+        series = 2 / 9 + y * (2 / 11 + y * (2 / 13 + y * (2 / 15 + y * (2 / 17 + y * (2 / 19)))))
+        logarithm = z * (2.0 + y * (2 / 3 + y * (2 / 5 + y * (2 / 7 + y * series))))
+        exponent = (np.float64(powers[k]) + logarithm * 1.4426950408889634) * exponents[k]
+        exponent = min(max(exponent, -1000.0), 100.0)
+        whole = np.floor(exponent + 0.5)
+        r = (exponent - whole) * 0.6931471805599453
+        series = 1 / 5040 + r * (1 / 40320 + r * (1 / 362880 + r * (1 / 3628800 + r * (1 / 39916800))))
+        series = 1.0 + r * (0.5 + r * (1 / 6 + r * (1 / 24 + r * (1 / 120 + r * (1 / 720 + r * series)))))
+        values[k] = 1.0 + r * series
+        powers[k] = (np.int64(whole) + np.int64(1023)) << np.int64(52)
+
+
+@_inlined
+def _join(count, values, powers):
+    """Multiply mantissas by powers of 2."""
+    for k in range(count):
+        values[k] *= powers[k]
+
+
 @_compiled
-def _new_bound(size, bound_per_size, size_floor):
+def _scale(ore):
+    """Return 3 / w, by which effective size answers to strength; without size effect it is 1 / strength."""
+    return ore.slope if ore.slope > 0.0 else 1.0
+
+
+@_compiled
+def _draw_weakness(streams, ore, weakness):
+    """Set the weakness zeta^(-w/3) of each cell, P(zeta > x) = exp(-x^k), by the mix of its stream's last number."""
+    for p in range(1, weakness.size - 1):
+        weakness[p] = _weakness(streams[p], ore)
+
+
+@_compiled
+def _weakness(state, ore):
+    power = (-math.log(uniform(mix(state)))) ** (-1.0 / (ore.scatter * _scale(ore)))
+    return np.float32(min(max(power, 1e-30), 1e30))
+
+
+@_inlined
+def _unshielded(size, bound_per_size, size_floor):
     """Return the bound of a cell whose neighbourhood is new; nothing below the floor ever breaks."""
     # without size effect every size may break
     bound = np.float32(size * bound_per_size) if bound_per_size != 0.0 else np.float32(_MARGIN)
@@ -297,13 +359,17 @@ def _close(line):
 @_compiled
 def set_bounds(parcel, ore):
     """Set the bounds of a line of cells whose neighbourhoods are all new."""
-    sizes, bounds, block_bounds = parcel.sizes, parcel.bounds, parcel.block_bounds
-    bound_per_size, size_floor = _bound_per_size(ore), ore.size_floor
+    sizes, _, weakness, unshielded, bounds, block_bounds = parcel
     cells = sizes.size - 2
-    for p in range(bounds.size):
-        bounds[p] = _NEVER
+    bound_per_size, size_floor = _bound_per_size(ore), ore.size_floor
+    unshielded[0] = unshielded[cells + 1] = _NEVER
     for p in range(1, cells + 1):
-        bounds[p] = _new_bound(np.float64(sizes[p]), bound_per_size, size_floor)
+        unshielded[p] = _unshielded(np.float64(sizes[p]), bound_per_size, size_floor)
+    if weakness.size:
+        for p in range(1, cells + 1):
+            unshielded[p] *= weakness[p]
+    for p in range(bounds.size):
+        bounds[p] = unshielded[p] if p <= cells else _NEVER
     for block in range(block_bounds.size):
         block_bounds[block] = _largest(bounds, block * BLOCK + 1) if block * BLOCK < cells else _NEVER
 
@@ -315,51 +381,61 @@ def workspace(cells):
     return Work(
         np.empty(most, np.uint32),
         np.empty(most, np.uint32),
-        np.ones(most, np.float32),
         np.ones(most),
+        np.ones(most),
+        np.ones(most),
+        np.empty(most, np.uint64),
         np.empty(most, np.float32),
         np.empty(most, np.uint8),
         np.empty(most, np.uint8),
     )
 
 
-@_compiled
-def _list_candidates(bounds, block_bounds, critical_ratio, active, places):
-    """List the blocks and the places whose bounds reach the critical ratio; return how many of each."""
-    needed = np.float32(min(critical_ratio, 3e38))  # float32 ends there, beyond every effective size
-    actives = candidates = 0
+@_inlined
+def _list_blocks(needed, block_bounds, active):
+    """List the blocks whose largest bound reaches what is needed; return their number."""
+    actives = 0
     for block in range(0, block_bounds.size, BLOCK):
         actives = _list_above(needed, block_bounds, block, np.uint32(block), active, actives)
+    return actives
+
+
+@_inlined
+def _list_candidates(needed, bounds, active, actives, places):
+    """List the places in active blocks whose bounds reach what is needed; return their number."""
+    candidates = 0
     for k in range(actives):
         first = active[k] * np.uint32(BLOCK) + np.uint32(1)
         candidates = _list_above(needed, bounds, np.int64(first), first, places, candidates)
-    return actives, candidates
+    return candidates
 
 
-@_compiled
-def _gather(sizes, places, candidates, found, totals):
-    """Fill sizes found and their sums with both neighbours."""
+@_inlined
+def _gather(sizes, weakness, places, candidates, ore, found, totals, ratios):
+    """Fill sizes found, their sums with both neighbours, and effective sizes over s_m without neighbours."""
+    inverse_size = 1.0 / ore.reference_size if ore.slope > 0.0 else 0.0
     for k in range(candidates):
         p = np.uint64(places[k])
-        size = sizes[p]
+        size = np.float64(sizes[p])
         # neighbours first: their sum is the same bits in a mirrored line
-        totals[k] = (np.float64(sizes[p - _1]) + np.float64(sizes[p + _1])) + np.float64(size)
+        totals[k] = (np.float64(sizes[p - _1]) + np.float64(sizes[p + _1])) + size
         found[k] = size
+        ratios[k] = size * inverse_size if inverse_size > 0.0 else 1.0
+    if weakness.size:
+        for k in range(candidates):
+            ratios[k] *= np.float64(weakness[np.uint64(places[k])])
 
 
-@_compiled
-def _decide(count, sizes, totals, ore, critical_ratio, bounds, breaks, unsure):
+@_inlined
+def _decide(count, sizes, totals, ratios, cushion, critical_ratio, bounds, breaks, unsure):
     """Decide breaks by rational bounds of the size-effect law and tighten the bounds; return whether any is unsure."""
-    sloped, cushion = ore.slope > 0.0, ore.cushion / (ore.slope if ore.slope > 0.0 else 1.0)
-    inverse_size = 1.0 / ore.reference_size
     # an effective size that has underflowed decides nothing: then only the logarithms do
     trusted = critical_ratio > 1e-200
     surely = critical_ratio * (1.0 + 1e-9) if trusted else np.inf
     hardly = critical_ratio * (1.0 - 1e-9) if trusted else 0.0
     doubts = np.int64(0)
     for k in range(count):
-        size, total = np.float64(sizes[k]), totals[k]
-        ratio = size * inverse_size if sloped else 1.0
+        size, total, ratio = sizes[k], totals[k], ratios[k]
         # log(s / sbar) = 2 artanh(z) between low and, up to zz = 1/2, high; exp(-y) between the two cubics.
         # Two divisions: one for sbar and one for the series' rest, zz^2 / (5 - 5 zz), would cost 15 ns a cell
         z = (3.0 * size - total) / (3.0 * size + total)
@@ -380,18 +456,19 @@ def _decide(count, sizes, totals, ore, critical_ratio, bounds, breaks, unsure):
 
 
 @_compiled
-def _decide_by_logarithms(candidates, sizes, totals, ore, log_stress, bounds, breaks, unsure):
+def _decide_by_logarithms(candidates, sizes, totals, weakness, places, ore, log_stress, bounds, breaks, unsure):
     """Decide the breaks that are unsure."""
     for k in range(candidates):
         if unsure[k]:
-            size = np.float64(sizes[k])
-            unlike = math.log(size / (totals[k] / 3.0))
-            strength = ore.cushion * unlike * unlike - ore.slope * math.log(size / ore.reference_size)
+            unlike = math.log(sizes[k] / (totals[k] / 3.0))
+            strength = ore.cushion * unlike * unlike - ore.slope * math.log(sizes[k] / ore.reference_size)
+            if weakness.size:
+                strength -= _scale(ore) * math.log(weakness[places[k]])
             breaks[k] = log_stress >= strength
-            bounds[k] = np.float32(math.exp(-strength / (ore.slope if ore.slope > 0.0 else 1.0)) * _MARGIN)
+            bounds[k] = np.float32(math.exp(-strength / _scale(ore)) * _MARGIN)
 
 
-@_compiled
+@_inlined
 def _list_breaks(candidates, found_bounds, breaks, bounds, places):
     """Store the bounds found and leave in `places` those that break; return their number."""
     # without branches: a mispredicted one costs more than the store
@@ -404,42 +481,93 @@ def _list_breaks(candidates, found_bounds, breaks, bounds, places):
     return found
 
 
-@_compiled
-def _break(sizes, streams, places, found, ore):
-    """Replace each cell that breaks by a fragment."""
+@_inlined
+def _draw(streams, places, found, states, ratios):
+    """Draw a uniform number for each cell that breaks."""
     for k in range(found):
         p = np.uint64(places[k])
-        state = streams[p] + _GOLDEN
-        streams[p] = state
-        ratio = uniform(state)
-        if ore.fragments == POWER_LAW and ore.inverse_exponent != 1.0:
-            ratio **= ore.inverse_exponent
-        sizes[p] = np.float32(max(sizes[p] * ratio, SMALLEST))
+        states[k] = streams[p] + _GOLDEN
+        streams[p] = states[k]
+    for k in range(found):
+        ratios[k] = uniform(states[k])
+
+
+@_compiled
+def _exponents(sizes, places, found, ore, powers, exponents, work):
+    """Fill the exponents 1 / gamma(s) of the parents' fragment ratios."""
+    for k in range(found):
+        powers[k], exponents[k] = ore.size_exponent, sizes[places[k]] / ore.parent_size
+    _split(found, exponents.view(np.int64), work.view(np.int64))
+    _exponentiate(found, exponents, powers, work.view(np.int64))
+    _join(found, exponents, work)
+    for k in range(found):
+        exponents[k] = min(max(ore.inverse_exponent / exponents[k], 1.0 / HELD[1]), 1.0 / HELD[0])
+
+
+@_inlined
+def _fill(exponents, count, inverse_exponent):
+    for k in range(count):
+        exponents[k] = inverse_exponent
+
+
+@_inlined
+def _settle_powers(sizes, streams, places, found, ratios, exponents):
+    """Take the library's power, which the bits are defined by, where ours may give another float32: next to a half."""
+    for k in range(found):
+        p = np.uint64(places[k])
+        if np.float32(sizes[p] * (ratios[k] * (1.0 - 1e-12))) != np.float32(sizes[p] * (ratios[k] * (1.0 + 1e-12))):
+            ratios[k] = uniform(streams[p]) ** exponents[k]
+
+
+@_inlined
+def _break(sizes, unshielded, places, found, ore, ratios):
+    """Replace each cell that breaks by its fragment."""
+    bound_per_size, size_floor = _bound_per_size(ore), ore.size_floor
+    for k in range(found):
+        p = np.uint64(places[k])
+        size = np.float32(max(sizes[p] * ratios[k], SMALLEST))
+        sizes[p] = size
+        unshielded[p] = _unshielded(np.float64(size), bound_per_size, size_floor)
     _close(sizes)
 
 
 @_compiled
-def _renew(sizes, bounds, places, found, ore):
-    """Set anew the bounds of the cells that broke and of their neighbours."""
-    bound_per_size, size_floor = _bound_per_size(ore), ore.size_floor
-    cells = sizes.size - 2
+def _draw_strength(streams, weakness, unshielded, places, found, ore):
+    """Draw the strength of each fragment."""
     for k in range(found):
         p = np.uint64(places[k])
-        for place in (p - _1, p, p + _1):
-            bounds[place] = _new_bound(np.float64(sizes[place]), bound_per_size, size_floor)
-    if found and places[0] == 1:
-        bounds[cells] = _new_bound(np.float64(sizes[cells]), bound_per_size, size_floor)
-    if found and places[found - 1] == cells:
-        bounds[1] = _new_bound(np.float64(sizes[1]), bound_per_size, size_floor)
-    bounds[cells + 1] = _NEVER
+        weakness[p] = _weakness(streams[p], ore)
+        unshielded[p] *= weakness[p]
 
 
-@_compiled
-def _renew_blocks(bounds, block_bounds, active, actives, cells):
-    """Take the largest bounds of the active blocks anew, and raise those beside them, where a seam was crossed."""
-    last = (cells - 1) // BLOCK
+@_inlined
+def _renew(unshielded, bounds, places, found):
+    """Set anew the bounds of the cells that broke and of their neighbours but across the ends of the line."""
+    for k in range(found):
+        p = np.uint64(places[k])
+        bounds[p - _1], bounds[p], bounds[p + _1] = unshielded[p - _1], unshielded[p], unshielded[p + _1]
+
+
+@_inlined
+def _renew_ends(unshielded, bounds, first, last):
+    """Set anew the bound of each end of the line beside which a cell broke, by the first and last place that did."""
+    cells = unshielded.size - 2
+    right, left = bounds[cells], bounds[1]
+    bounds[cells] = unshielded[cells] if first == 1 else right
+    bounds[1] = unshielded[1] if last == cells else left
+
+
+@_inlined
+def _renew_blocks(bounds, block_bounds, active, actives):
+    """Take the largest bounds of the active blocks anew."""
     for k in range(actives):
         block_bounds[active[k]] = _largest(bounds, np.int64(active[k]) * BLOCK + 1)
+
+
+@_inlined
+def _renew_seams(bounds, block_bounds, active, actives, cells):
+    """Raise the largest bounds of the blocks beside the active ones, where a seam was crossed."""
+    last = (cells - 1) // BLOCK
     for k in range(actives):
         block = np.int64(active[k])
         before, after = block - 1 if block > 0 else last, block + 1 if block < last else 0
@@ -455,33 +583,56 @@ def crush(parcel, path, ore, work, record):
     Every break of a point is decided on the sizes before it, and a cell breaks once at a point. A break draws one
     number of the cell's own stream. One call for all points: handing over the tuples costs as much as a step.
     """
-    sizes, streams, bounds, block_bounds = parcel
-    active, places, chosen, totals, tight, breaking, unsure = work
+    sizes, streams, weakness, unshielded, bounds, block_bounds = parcel
+    active, places, chosen, totals, ratios, states, tight, breaking, unsure = work
     log_stress, critical_ratio = path
     sieves, snapshots, classes = record
+    bits, ratio_bits = chosen.view(np.int64), ratios.view(np.int64)
+    cushion = ore.cushion / _scale(ore)
+    powers = ore.fragments == POWER_LAW and (ore.inverse_exponent != 1.0 or ore.size_exponent != 0.0)
     counts = np.zeros(sieves.size + 1, np.int64)
     if sieves.size:
         for p in range(1, sizes.size - 1):
             counts[sieve_class(sieves, sizes[p])] += 1
     breaks = 0
     for j in range(log_stress.size):
-        ratio = critical_ratio[j]
-        if ratio < np.inf:
-            actives, count = _list_candidates(bounds, block_bounds, ratio, active, places)
-            _gather(sizes, places, count, chosen, totals)
+        critical = critical_ratio[j]
+        if critical < np.inf:
+            needed = np.float32(min(critical, 3e38))  # float32 ends there, beyond every effective size
+            actives = _list_blocks(needed, block_bounds, active)
+            count = _list_candidates(needed, bounds, active, actives, places)
+            _gather(sizes, weakness, places, count, ore, chosen, totals, ratios)
             if ore.strength == SIZE_EFFECT:
                 # in whole vectors; what is decided beyond the last candidate is not read
                 whole = (count + BLOCK - 1) // BLOCK * BLOCK
-                if _decide(whole, chosen, totals, ore, ratio, tight, breaking, unsure):
-                    _decide_by_logarithms(count, chosen, totals, ore, log_stress[j], tight, breaking, unsure)
+                if _decide(whole, chosen, totals, ratios, cushion, critical, tight, breaking, unsure):
+                    _decide_by_logarithms(
+                        count, chosen, totals, weakness, places, ore, log_stress[j], tight, breaking, unsure
+                    )
             found = _list_breaks(count, tight, breaking, bounds, places)
             if sieves.size:
                 _count(sizes, places, found, sieves, -1, counts)
-            _break(sizes, streams, places, found, ore)
+            _draw(streams, places, found, states, chosen)
+            if powers:
+                if ore.size_exponent != 0.0:
+                    _exponents(sizes, places, found, ore, ratios, totals, states.view(np.float64))
+                else:
+                    _fill(totals, found + 7, ore.inverse_exponent)
+                whole = (found + 7) // 8 * 8
+                _split(whole, bits, ratio_bits)
+                _exponentiate(whole, chosen, totals, ratio_bits)
+                _join(whole, chosen, ratios)
+                _settle_powers(sizes, streams, places, found, chosen, totals)
+            _break(sizes, unshielded, places, found, ore, chosen)
+            if weakness.size:
+                _draw_strength(streams, weakness, unshielded, places, found, ore)
             if sieves.size:
                 _count(sizes, places, found, sieves, 1, counts)
-            _renew(sizes, bounds, places, found, ore)
-            _renew_blocks(bounds, block_bounds, active, actives, sizes.size - 2)
+            _renew(unshielded, bounds, places, found)
+            if found:
+                _renew_ends(unshielded, bounds, places[0], places[found - 1])
+            _renew_blocks(bounds, block_bounds, active, actives)
+            _renew_seams(bounds, block_bounds, active, actives, sizes.size - 2)
             breaks += found
         if snapshots.size:
             for p in range(1, sizes.size - 1):
@@ -514,12 +665,14 @@ def march(sizes, streams, lines, path, ore, record, breaks):
     """
     cells = sizes.shape[1] - 2
     blocks = (cells + BLOCK - 1) // BLOCK
-    bounds = np.empty(blocks * BLOCK + 2, np.float32)
+    weakness = np.empty(cells + 2 if ore.scatter < np.inf else 0, np.float32)
+    unshielded, bounds = np.empty(cells + 2, np.float32), np.empty(blocks * BLOCK + 2, np.float32)
     block_bounds = np.empty((blocks + BLOCK - 1) // BLOCK * BLOCK, np.float32)
     work = workspace(cells)
     no_snapshots, no_classes = np.empty((0, 0), np.float32), np.empty((0, 0), np.int64)
     for k in range(lines.size):
-        parcel = Parcels(sizes[k], streams[k], bounds, block_bounds)
+        parcel = Parcels(sizes[k], streams[k], weakness, unshielded, bounds, block_bounds)
+        _draw_weakness(parcel.streams, ore, weakness)
         _close(parcel.sizes)
         set_bounds(parcel, ore)
         own = Path(path.log_stress[lines[k]], path.critical_ratio[lines[k]])
@@ -556,8 +709,16 @@ def crush_lattice(parcels, bounds_outdated, breaks, slots, path, ore):
         if path.critical_ratio[point] == np.inf:
             continue
         slot = slots[point]
-        parcel = Parcels(parcels.sizes[slot], parcels.streams[slot], parcels.bounds[slot], parcels.block_bounds[slot])
+        parcel = Parcels(
+            parcels.sizes[slot],
+            parcels.streams[slot],
+            parcels.weakness[slot],
+            parcels.unshielded[slot],
+            parcels.bounds[slot],
+            parcels.block_bounds[slot],
+        )
         if bounds_outdated[slot]:
+            _draw_weakness(parcel.streams, ore, parcel.weakness)
             _close(parcel.sizes)
             set_bounds(parcel, ore)
             bounds_outdated[slot] = False

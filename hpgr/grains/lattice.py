@@ -1,5 +1,6 @@
 """With exchange: the whole lattice in motion. Each step all parcels shift by one point, are crushed, and swap cells."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -150,6 +151,8 @@ class Lattice:
         self.parcels = Parcels(
             np.zeros((count, cells + 2), np.float32),
             np.zeros((count, cells + 2), np.uint64),
+            np.empty((count, 0 if math.isinf(scene.strength.scatter) else cells + 2), np.float32),
+            np.empty((count, cells + 2), np.float32),
             np.empty((count, blocks * kernels.BLOCK + 2), np.float32),
             np.empty((count, -(-blocks // kernels.BLOCK) * kernels.BLOCK), np.float32),
         )
