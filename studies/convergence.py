@@ -1,4 +1,4 @@
-"""What refinement tells of an error: order and limit of three grids, exponent of noise, Pareto front."""
+"""What refinement tells of an error: order and limit of three grids, and which choices are worth their cost."""
 
 from collections.abc import Callable
 
@@ -29,26 +29,12 @@ def richardson(coarse, medium, fine) -> np.ndarray:
     return fine + (fine - medium) / (2**order - 1)
 
 
-def noise_exponent(sizes, noise, replicates: int) -> tuple[float, float]:
-    """Return the exponent of noise against `sizes`, and its standard error; NaN if there is no noise.
-
-    A standard deviation of R replicates is known to 1 / sqrt(2 (R - 1)) of itself.
-    """
-    sizes, noise = np.log(np.asarray(sizes, float)), np.asarray(noise, float)
-    if not (noise > ROUNDING).all():
-        return np.nan, np.nan
-    away = sizes - sizes.mean()
-    slope = float(away @ np.log(noise) / (away @ away))
-    return slope, float(1 / np.sqrt(2 * (replicates - 1) * (away @ away)))
-
-
 def pareto(cost, error) -> np.ndarray:
     """Return where nothing else is at most as costly and at most as wrong; of equals the first."""
-    cost, error = np.asarray(cost, float), np.asarray(error, float)
-    front, least = np.zeros(cost.size, bool), np.inf
-    for k in np.lexsort((error, cost)):
-        front[k] = error[k] < least
-        least = min(least, error[k])
+    order = np.lexsort((error, cost))
+    least = np.minimum.accumulate(np.asarray(error, float)[order])
+    front = np.zeros(order.size, bool)
+    front[order[np.diff(least, prepend=np.inf) < 0]] = True
     return front
 
 

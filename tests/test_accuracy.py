@@ -3,13 +3,12 @@ import io
 import numpy as np
 import pytest
 import xarray as xr
-from support import SIGMAS, paper
+from support import paper
 
 import hpgr
-from hpgr.grains import march, solve
-from hpgr.run import load, run_scene
+from hpgr.run import run_scene
 from studies import accuracy
-from studies.convergence import jackknife, noise_exponent, observed_order, pareto, richardson
+from studies.convergence import jackknife, observed_order, pareto, richardson
 from studies.show import accuracy_tables as tables
 from studies.show.plots.accuracy import accuracy_figure
 
@@ -53,19 +52,6 @@ def test_no_order_where_changes_differ_in_sign_or_are_none():
     assert np.isnan(observed_order(7.0, 7.0 * (1 - 2e-16), 7.0 * (1 - 4e-16)))  # rounding is no change
 
 
-def test_noise_exponent():
-    """An exact power law gives its exponent; sampled noise leaves +-5 standard errors once in 1.7 million times."""
-    sizes = np.array([10, 20, 40, 80])
-    slope, _ = noise_exponent(sizes, 3 / np.sqrt(sizes), 8)
-    assert slope == pytest.approx(-0.5, abs=1e-12)
-    generator = np.random.default_rng(0)
-    means = [[generator.normal(size=size).mean() for _ in range(200)] for size in sizes]
-    slope, error = noise_exponent(sizes, np.std(means, axis=1, ddof=1), 200)
-    assert abs(slope + 0.5) < SIGMAS * error
-    assert error < 0.06
-    assert np.isnan(noise_exponent(sizes, np.zeros(4), 8)).all()
-
-
 def test_jackknife_of_a_mean_is_its_standard_error():
     samples = np.random.default_rng(1).normal(size=(3, 9, 2))
     found = jackknife(lambda means: means, samples)
@@ -78,23 +64,7 @@ def test_pareto_by_hand():
     assert front.tolist() == [True, False, True, False, False, True, False]
 
 
-def test_plain_rule_is_the_march_s_bit_for_bit():
-    scene = paper({"resolution.cells": 40})
-    scene, bed = load(scene)
-    log_stress = scene.strength.log_stress(solve.crushing_stress(scene, bed))
-    compiled = run_scene(scene).values["size"][0, :, -1]
-    for line in range(3):
-        sizes, streams = (part[0, 1:-1].copy() for part in march.first_cells(scene, 0, [(0, line, 0)]))
-        entered = sizes.copy()
-        accuracy.plain_march(scene, sizes, streams, log_stress[line])
-        assert (sizes < entered).sum() > 20
-        np.testing.assert_array_equal(sizes, compiled[line])
-
-
-def test_storage_differs_by_its_rounding_and_the_lattice_without_swaps_is_the_march(measured):
-    """Unless a decision falls the other way, a size has taken at most one rounding of 6e-8 for every break."""
-    apart = measured["storage_bias"].sel(storage="float32", quantity=["p50", "p80"])
-    assert 0 < np.abs(apart).max() < 30 * 6e-8
+def test_the_lattice_without_swaps_is_the_march(measured):
     for name in accuracy.QUANTITIES:
         solved = measured[f"solver_{name}"]
         assert (solved.sel(solver="lattice") == solved.sel(solver="march")).all()
@@ -129,12 +99,9 @@ def test_bias_noise_and_error_are_those_of_the_samples(measured):
     bias = (measured["points_p80"].sel(variant="scene").mean("replicate") - limit) / abs(limit)
     np.testing.assert_allclose(measured["points_bias"].sel(variant="scene", quantity="p80"), bias)
     error = np.abs(measured["combination_bias"]) + 2 * measured["combination_noise"]
-    np.testing.assert_allclose(measured["combination_error"], error)
     worst = error.sel(quantity=["p50", "p80", "below_1mm"]).max("quantity")
     np.testing.assert_allclose(measured["combination_worst_error"], worst)
     assert measured.sizes["combination"] == 4
-    assert tables.chosen(measured, float(worst.max())) == int(measured["combination_wall_time"].values.argmin())
-    assert tables.chosen(measured, 0.0) is None
 
 
 def test_same_seed_same_figures(measured):
@@ -168,16 +135,15 @@ def test_a_machine_with_a_pressing_force_is_measured_at_the_gap_that_carries_it(
 )
 def test_scenes_in_which_little_happens_have_errors_too(values, silent):
     result = accuracy.study(paper(values), TINY)
-    assert np.isfinite(result["combination_error"]).all()
+    assert np.isfinite(result["combination_worst_error"]).all()
     if silent:
         assert (result["cells_noise"] == 0).all()
-        assert tables._noise(result).rows[1] == ["cells", "-", "-", "-"]
     if "rolls.entry_gap" in values:
         assert (result["points_bias"].sel(quantity="peak_pressure") == 0).all()
         assert result["variant"].values.tolist() == ["scene", "euler"]  # the scene's own n = 0.5 is not run twice
     accuracy_figure(result).savefig(io.BytesIO(), dpi=20)
     for markdown in (False, True):
-        assert "-" in tables.in_words(tables.every(result), markdown)
+        assert "-" in tables.in_words(result, markdown)
 
 
 @pytest.fixture
