@@ -64,10 +64,12 @@ def streams(cells, seed=0):
     return np.array([split_mix(base + (p + 1) * GOLDEN) for p in range(cells)], np.uint64)
 
 
-def laws(w=3.04, n=1.0, gamma=1.0, reference_size=0.06, floor=1e-6):
+def laws(w=3.04, n=1.0, gamma=1.0, reference_size=0.06, floor=1e-6, k=math.inf, nu=0.0):
     """Return the laws of strength and fragments by the symbols of their constants."""
-    strength = Strength(weibull_modulus=w, cushioning=n, reference_size=reference_size)
-    fragments = Fragments.model_construct(exponent=gamma, size_floor=floor)  # a floor of 0 is refused elsewhere
+    strength = Strength(weibull_modulus=w, cushioning=n, reference_size=reference_size, scatter=k)
+    fragments = Fragments.model_construct(
+        exponent=gamma, size_floor=floor, size_exponent=nu
+    )  # a floor of 0 is refused elsewhere
     return SimpleNamespace(strength=strength, fragments=fragments)
 
 

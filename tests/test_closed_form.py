@@ -3,9 +3,9 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from support import KS, SIGMAS, critical_log_stress, draw, ks_distance, march, sized, streams
+from support import KS, SIGMAS, critical_log_stress, draw, ks_distance, laws, march, sized, streams
 
-from hpgr.grains.closed_form import crushed_passing, expected_breaks, percentile
+from hpgr.grains.closed_form import _cascade, crushed, crushed_passing, expected_breaks, percentile
 from hpgr.laws.feed import PowerLawFeed, RosinRammlerFeed, SingleFeed, TableFeed, UniformFeed
 
 INF = math.inf
@@ -89,3 +89,40 @@ def test_expected_breaks_of_one_size():
 
 def test_far_above_the_critical_size_a_steep_exponent_overflows_in_silence():
     assert crushed_passing(FEEDS["uniform"], np.array([1e-9, 0.01]), 1e-8, 1e6).tolist() == [0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    "constants",
+    [{"k": 1.0, "gamma": 0.4}, {"k": 0.3, "gamma": 1.5, "nu": 2.0}, {"nu": 0.7, "gamma": 0.3}, {"k": 0.15, "nu": -0.4}],
+)
+def test_scatter_and_parents_of_the_closed_form_are_the_march_run_to_completion(constants):
+    """A16, A17. KS for plain sampling: by chance once in a million; the cascade's own error is below 1e-4.
+
+    Below a twentieth of the size floor, where parents of 1 um may leave much, the closed form tells nothing.
+    """
+    cells, critical, feed = sized(50_000, 1_000), 0.007, FEEDS["uniform"]
+    law = laws(**constants)
+    passing, breaks = crushed(feed, law.strength, law.fragments, np.array([critical]))
+    drawn = draw(feed, cells, np.random.SeedSequence(62))
+    level = critical_log_stress(critical)
+    found, _, count = march(drawn, streams(cells, 62), [level] * 150, n=INF, **constants)
+    sizes = np.geomspace(1e-7, 0.06, 2000)
+    shares = np.searchsorted(np.sort(found), sizes) / cells
+    assert np.abs(shares - passing(size=sizes[:, None])[:, 0]).max() < KS / math.sqrt(cells) + 1e-4
+    assert count / cells == pytest.approx(float(breaks[0]), abs=SIGMAS * math.sqrt(12 / cells))
+
+
+@each
+def test_cascade_has_the_papers_law_as_its_limit(feed):
+    """A3 and A2 for k = inf and nu = 0, by classes; scatter of a large k tends to it."""
+    sizes, critical = np.geomspace(2e-6, 0.05, 60), np.array([0.002, 0.02])
+    exact = crushed_passing(feed, sizes[:, None], critical, 0.35)
+    law = laws(gamma=0.35)
+    edges, cumulative, breaks = _cascade(feed, law.strength, law.fragments, critical)
+    found = np.array([np.interp(np.log(sizes), edges, cumulative[:, line]) for line in range(2)]).T
+    apart = np.abs(np.log(sizes[:, None] / critical)) > edges[1] - edges[0]  # not within the class of s_c
+    assert np.abs(found - exact)[apart].max() < 3e-4
+    # of one size all the feed is at the top of its class, not spread over it: breaks miss gamma times half its width
+    assert breaks == pytest.approx(expected_breaks(feed, critical, 0.35), abs=6e-3)
+    sharp = crushed(feed, laws(k=100.0).strength, law.fragments, critical)[0](size=sizes[:, None])
+    assert np.abs(sharp - exact).max() < 0.02

@@ -30,16 +30,28 @@ MASK = 2**64 - 1
 # --- the plain reference -----------------------------------------------------------------------------------
 
 
+def uniform_of(state):
+    return ((split_mix(state) >> 12) + 0.5) / 2**52
+
+
 def reference(sizes, streams, log_stress, **constants):
     """The march of the model page, section 4, by the laws' own equations: every cell is looked at in every step."""
     sizes, states, breaks, every = sizes.copy(), [int(state) for state in streams], 0, []
     law = laws(**constants)
+    scale = 3 / law.strength.weibull_modulus or 1.0
+
+    def log_zeta(state):  # by the number after the one that the fragment was drawn by, rounded as it is stored
+        weakness = law.strength.zeta(uniform_of(split_mix(state))) ** (-1 / scale)
+        return -scale * math.log(np.float32(np.clip(weakness, 1e-30, 1e30)))
+
+    scattered = np.array([log_zeta(state) for state in states])
     for level in log_stress:
-        breaking = (level >= law.strength.log_strength(sizes)) & (sizes.astype(float) >= law.fragments.size_floor)
-        for p in np.flatnonzero(breaking):
+        strength = law.strength.log_strength(sizes) + scattered
+        for p in np.flatnonzero((level >= strength) & (sizes.astype(float) >= law.fragments.size_floor)):
             states[p] = (states[p] + GOLDEN) & MASK
-            uniform = ((split_mix(states[p]) >> 12) + 0.5) / 2**52
-            sizes[p] = np.float32(max(float(sizes[p]) * float(law.fragments.quantile(uniform)), 1e-30))
+            ratio = law.fragments.quantile(uniform_of(states[p]), float(sizes[p]))
+            sizes[p] = np.float32(max(float(sizes[p]) * float(ratio), 1e-30))
+            scattered[p] = log_zeta(states[p])
             breaks += 1
         every.append(sizes.copy())
     return sizes, np.array(states, np.uint64), breaks, np.array(every).reshape(-1, sizes.size)
@@ -75,6 +87,14 @@ def test_march_is_the_plain_reference_for_every_weibull_modulus(w):
     for n in (0.3, 1.0, INF):
         for history in histories(30, seed=1).values():
             assert same(sizes, states, history, n=n, w=w)
+
+
+@pytest.mark.parametrize(("k", "w", "nu"), [(0.5, 3.04, 0.0), (math.inf, 3.04, 0.7), (0.1, 3.04, -0.4), (3, INF, 2)])
+def test_scattered_strengths_and_fragments_by_parent_are_the_plain_reference(k, w, nu):
+    sizes, states = line(200, seed=2)
+    for history in histories(30, seed=2).values():
+        for n in (0.5, INF):
+            assert same(sizes, states, history, n=n, k=k, w=w, nu=nu, gamma=0.5)
 
 
 @given(

@@ -81,6 +81,10 @@ class SizeEffectStrength(Frozen):
         cushion = (np.log(sizes / mean) / self.cushioning) ** 2 / 2
         return cushion - 3 / self.weibull_modulus * np.log(sizes / self.reference_size)
 
+    def zeta(self, uniform):
+        """Return the factors of scattered strength that uniform numbers in (0, 1) stand for; 1 without scatter."""
+        return (-np.log(uniform)) ** (1 / self.scatter)
+
     def critical_size(self, log_stress):
         """Return the size in m above which grains break at ln(sigma_a / sigma_m) without cushioning; inf at -inf.
 
