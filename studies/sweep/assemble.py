@@ -26,8 +26,7 @@ _IN_FILES = {"time": "snapshot"}  # names that differ in files, see `netcdf.writ
 def assemble(plan: Plan, results: Iterable[CaseResult]) -> xr.Dataset:
     """Return one Dataset of all results over the axes and replicates, the same whatever their order."""
     spec, space = plan.spec, plan.space
-    along = _of_axes(space)
-    values: dict[str, Any] = along | {
+    values: dict[str, Any] = {
         "status": np.full(space.shape, schema.STATUS["failed"], np.int8),
         "message": np.full(space.shape, "", object),
         "diagnostics": np.full(space.shape, "", object),
@@ -57,29 +56,34 @@ def assemble(plan: Plan, results: Iterable[CaseResult]) -> xr.Dataset:
     attrs |= {} if spec.tolerance is None else {"tolerance": spec.tolerance}
     if SCENE in space.axes:
         attrs["scenes"] = json.dumps({name: one.model_dump_json() for name, one in space.bases(spec.base).items()})
-    order = [*along, *schema.COORDINATES, *schema.VARIABLES, *schema.SWEEP]
+    order = [*schema.COORDINATES, *schema.VARIABLES, *schema.SWEEP]
     found = {name: values[name] for name in order if name in values and name not in uneven}
     return _labelled(space, found, attrs).assign_coords(_held(spec.base, space))
 
 
-def _of_axes(space: Space) -> dict[str, Any]:
-    """Return the coordinates along the dimensions of a sweep."""
-    found = {dim: np.array(axis.labels) for dim, axis in space.axes.items() if axis.labels is not None}
-    for axis in space.axes.values():
-        found |= {dim_of(field): np.array([place[field] for place in axis.places]) for field in axis.fields}
-    return found | {"replicate": np.arange(space.replicates)}
+def coordinates(space: Space) -> dict[str, xr.Variable]:
+    """Return the coordinates along the dimensions of a sweep: fields, and what places are called."""
+    found = {}
+    for dim, axis in space.axes.items():
+        if axis.labels is not None:
+            found[dim] = xr.Variable((dim,), np.array(axis.labels), {"long_name": f"{dim} number or name"})
+        for field in axis.fields:
+            entry = schema.field_axis(field, dim)
+            found[dim_of(field)] = xr.Variable((dim,), [place[field] for place in axis.places], entry.attributes())
+    numbers = np.arange(space.replicates, dtype=np.int32)
+    return found | {"replicate": xr.Variable(("replicate",), numbers, schema.attributes("replicate"))}
 
 
 def _labelled(space: Space, values: dict[str, Any], attrs: dict[str, Any]) -> xr.Dataset:
     """Return arrays over the dimensions of a sweep and those of a simulation as a Dataset."""
-    own = {dim: schema.Variable((dim,), "", f"{dim} number or name", dtype=None) for dim in space.axes}
-    own |= {dim_of(field): schema.field_axis(field, dim) for dim, axis in space.axes.items() for field in axis.fields}
-    for name, entry in (schema.COORDINATES | schema.VARIABLES | schema.SWEEP).items():
-        if name not in space.dims and not _common(name):
-            own[name] = entry._replace(dims=(*space.dims, *entry.dims))
+    own = {
+        name: entry._replace(dims=(*space.dims, *entry.dims))
+        for name, entry in (schema.COORDINATES | schema.VARIABLES | schema.SWEEP).items()
+        if name not in space.dims and not _common(name)
+    }
     # what a mean over replicates has no sense of is a coordinate, which xarray leaves out of it
     apart = [name for name in (*schema.SWEEP, "flags") if name in values]
-    return schema.to_dataset(values, attrs, own).set_coords([*map(dim_of, space.fields), *apart])
+    return schema.to_dataset(values, attrs, own).set_coords(apart).assign_coords(coordinates(space))
 
 
 def _common(name: str) -> bool:
@@ -180,7 +184,7 @@ def open_cases(folder: str | Path) -> xr.Dataset:
     folder = Path(folder)
     told = _manifest(folder / _MANIFEST)
     space = Space({dim: Axis(**axis) for dim, axis in told["axes"].items()}, told["replicates"])
-    values = _of_axes(space) | {"status": np.array(told["status"]).reshape(space.shape)}
+    values: dict[str, Any] = {"status": np.array(told["status"]).reshape(space.shape)}
     paths = [
         str(folder / f"{address}.nc") if code == schema.STATUS["ok"] else ""
         for address, code in zip(told["addresses"], told["status"], strict=True)
