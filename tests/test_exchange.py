@@ -209,7 +209,7 @@ class Column:
         points, cells = sizes.shape
         states = np.arange(points * cells, dtype=np.uint64).reshape(points, cells)
         nothing = np.empty((points, 0), np.float32)
-        self.parcels = Parcels(*(np.pad(part, ((0, 0), (1, 1))) for part in (sizes, states)), nothing, nothing)
+        self.parcels = Parcels(*(np.pad(part, ((0, 0), (1, 1))) for part in (sizes, states)), *[nothing] * 4)
         self.slots = np.arange(points)
         if pairs is None:
             pairs = np.column_stack([np.arange(points - 1), np.arange(1, points)])

@@ -496,7 +496,7 @@ def _draw(streams, places, found, states, ratios):
 def _exponents(sizes, places, found, ore, powers, exponents, work):
     """Fill the exponents 1 / gamma(s) of the parents' fragment ratios."""
     for k in range(found):
-        powers[k], exponents[k] = ore.size_exponent, sizes[places[k]] / ore.parent_size
+        powers[k], exponents[k] = ore.size_exponent, np.float64(sizes[places[k]]) / ore.parent_size
     _split(found, exponents.view(np.int64), work.view(np.int64))
     _exponentiate(found, exponents, powers, work.view(np.int64))
     _join(found, exponents, work)
