@@ -269,6 +269,10 @@ def many_attributes(file, secret):
         file["a"].attrs[f"b{k}"] = k
 
 
+def many_texts(file, secret):
+    file.attrs["b"] = np.array(["x"] * 200, object)
+
+
 def bomb(file, secret):
     found = file.create_dataset("b", (2**33,), "f4", chunks=(2**20,), compression="gzip")
     found[: 2**20] = 0
@@ -278,8 +282,18 @@ def never_written(file, secret):
     file.create_dataset("b", (2**40,), "f4", chunks=(2**20,))
 
 
+def one_text_at_many_places(file, secret):
+    kind = h5py.string_dtype()
+    file.create_dataset("b", (2**22,), kind, chunks=(2**12,), compression="gzip")
+    file["b"][0] = "x" * 1000
+    found = file["b"].id.read_direct_chunk((0,))
+    raw = zlib.decompress(found[1])
+    for k in range(0, 2**22, 2**12):
+        file["b"].id.write_direct_chunk((k,), zlib.compress(raw[:16] * 2**12))
+
+
 HOSTILE = [external_dataset, external_link, soft_link, virtual_dataset, user_filter, nested, cycle, two_places, depth]
-HOSTILE += [many_groups, many_attributes, bomb, never_written]
+HOSTILE += [one_text_at_many_places, many_groups, many_attributes, many_texts, bomb, never_written]
 
 
 @pytest.mark.parametrize("make", HOSTILE, ids=lambda make: make.__name__)

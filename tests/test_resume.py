@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from support import paper, sized
 
 from hpgr.results.schema import STATUS
 from studies.sweep import cases, netcdf, run, sweep
+from studies.sweep.space import Space, SweepSpec, axes_of
 
 SMALL = {"resolution.streamlines": 2, "resolution.points": 20, "resolution.cells": 16}
 GAPS = [0.04, 0.05, 0.06]
@@ -178,6 +180,53 @@ def test_a_file_that_only_exists_counts_for_nothing(base, client, tmp_path, coun
     counted.clear()
     sweep(base, {"rolls.gap": GAPS[:2]}, **options)
     assert len(counted) == 1
+
+
+def test_driver_that_waits_says_for_whom_and_takes_over_from_the_silent(base, client, tmp_path, monkeypatch):
+    """Another driver is stopped while it holds a case: it keeps its lock, and gives no sign of life."""
+    told = []
+
+    def say(text):
+        told.append(text)
+        monkeypatch.setattr(cases, "_SILENT_SECONDS", -1.0)  # the other has been silent for too long from now on
+
+    monkeypatch.setattr(run, "say", say)
+    monkeypatch.setattr(run, "_PATIENCE", 0.0)
+    monkeypatch.setattr(cases, "_SILENT_SECONDS", np.inf)
+    case = Space(axes_of({"rolls.gap": GAPS})).case(1)
+    spec = SweepSpec(base.with_values({"resolution.record": "product"}))
+    with cases.CaseFolder(tmp_path) as stopped:
+        assert stopped.claim(cases.Addresses(spec).of(case.values, case.replicate))
+        found = sweep(base, {"rolls.gap": GAPS}, client=client, folder=tmp_path)
+    words = rf"waiting for 1 cases that other drivers hold: process {os.getpid()} on .*, last sign of life \d+ s ago"
+    assert re.fullmatch(words, told[0])
+    xr.testing.assert_identical(found, sweep(base, {"rolls.gap": GAPS}, client=client))
+
+
+@pytest.mark.slow
+def test_interrupt_ends_in_one_line_and_the_same_command_goes_on(tmp_path):
+    command = [
+        sys.executable,
+        "-m",
+        "studies.gap_sweep",
+        "--gap",
+        "40 mm",
+        "60 mm",
+        "--replicates",
+        "5000",
+        "--no-plot",
+    ]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as driver:
+        while not list(tmp_path.rglob("*.seg")):
+            assert driver.poll() is None
+            time.sleep(0.05)
+        driver.send_signal(signal.SIGINT)
+        told = driver.communicate(timeout=100)[1]
+    assert driver.returncode == 130, told
+    said = [line for line in told.splitlines() if line and "cases" not in line.split("; ")[0]]
+    assert said == ["interrupted; a sweep's finished cases are kept, and the same command goes on from there"]
+    assert list(tmp_path.rglob("*.seg"))
+    assert not list(tmp_path.rglob(".hpgr-*"))
 
 
 # ---- cases that misbehave, in processes of their own

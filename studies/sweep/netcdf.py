@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import os
 import re
 import secrets
@@ -26,6 +27,7 @@ _MOST_ITEMS, _DEEPEST = (
     10_000,
     8,
 )  # variables and groups of a file, attributes of each; groups in groups: ours have none
+_MOST_TEXTS = 100  # in an attribute: one, stored once, may stand at any number of places
 _MOST_BYTES, _MOST_RATIO = 250_000_000, 100  # what a variable may unpack to: this much, or this many times the file
 _MOST_SCENE = 1_000_000  # characters of a scene as JSON
 
@@ -354,33 +356,52 @@ def _fault(path: Path) -> str | None:
     with _LIBRARY:
         try:
             with h5py.File(path, "r") as file:
-                return next(_faults(file, set(), _DEEPEST), None)
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
+                return next(_faults(file["/"], path.stat().st_size, set(), _DEEPEST), None)
+        except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path}: cannot be read as NetCDF; it is no such file, or damaged ({error})") from error
 
 
-def _faults(group: Any, seen: set, depth: int) -> Iterator[str]:
-    """Yield what in an HDF5 group and below it is as in no file of ours."""
+def _faults(item: Any, size: int, seen: set, depth: int) -> Iterator[str]:
+    """Yield what about an HDF5 group or variable, and in it, is as in no file of ours."""
     import h5py
 
-    for name in group:
-        place = f"{group.name.rstrip('/')}/{name}"
-        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-            yield f"{place} is a link to another place"
-            continue
-        item = group[name]
-        key = (h5py.h5o.get_info(item.id).fileno, h5py.h5o.get_info(item.id).addr)
-        if key in seen:
-            yield f"{place} is in two places at once"
-        seen.add(key)
-        if len(seen) > _MOST_ITEMS or len(item.attrs) > _MOST_ITEMS:
-            yield f"{place} is one of more than {_MOST_ITEMS:,} groups, variables or attributes"
-        if isinstance(item, h5py.Group):
-            if depth == 0:
-                yield f"{place} is in too many groups"
-            yield from _faults(item, seen, depth - 1)
-        elif isinstance(item, h5py.Dataset):
-            yield from _foreign(place, item.id.get_create_plist())
+    place, info = item.name, h5py.h5o.get_info(item.id)
+    if (info.fileno, info.addr) in seen:
+        yield f"{place} is in two places at once"
+    seen.add((info.fileno, info.addr))
+    if len(seen) > _MOST_ITEMS or len(item.attrs) > _MOST_ITEMS:
+        yield f"{place} is one of more than {_MOST_ITEMS:,} groups, variables or attributes"
+    attributes = (item.attrs.get_id(name) for name in item.attrs)
+    if any(each.dtype == object and math.prod(each.shape) > _MOST_TEXTS for each in attributes):
+        yield f"{place} has an attribute of more than {_MOST_TEXTS} texts"
+    if isinstance(item, h5py.Dataset):
+        yield from _foreign(place, item.id.get_create_plist())
+        if item.dtype == object and _unpacked(item) > max(_MOST_BYTES, _MOST_RATIO * size):
+            yield f"{place} would unpack to more than {_MOST_BYTES:,} bytes"
+    elif isinstance(item, h5py.Group):
+        if depth == 0:
+            yield f"{place} is in too many groups"
+        for name in item:
+            if not isinstance(item.get(name, getlink=True), h5py.HardLink):
+                yield f"{place.rstrip('/')}/{name} is a link to another place"
+            yield from _faults(item[name], size, seen, depth - 1)
+
+
+def _unpacked(texts: Any) -> int:
+    """Return the bytes of a variable of texts, which may be one in many places; counted until it is too much."""
+    import h5py
+
+    total, batch = 0, 1000
+    for start in range(0, texts.size, batch):
+        places = np.arange(start, min(start + batch, texts.size))
+        found, within = np.empty(places.size, texts.dtype), texts.id.get_space()
+        if texts.shape:
+            within.select_elements(np.stack(np.unravel_index(places, texts.shape), axis=1).astype(np.uint64))
+        texts.id.read(h5py.h5s.create_simple(found.shape), within, found)
+        total += sum(map(len, found)) + 64 * places.size  # of memory that even nothing takes
+        if total > _MOST_BYTES:
+            return total
+    return total
 
 
 def _foreign(place: str, plist: Any) -> Iterator[str]:

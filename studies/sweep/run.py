@@ -1,5 +1,6 @@
 """Cases to dask and back: a bounded number in flight, and a case that takes its worker down loses only itself."""
 
+import logging
 import queue
 import time
 from collections import deque
@@ -280,6 +281,7 @@ def own_client(threads: int) -> Iterator[Any]:
             dashboard_address="127.0.0.1:0",
             worker_dashboard_address="127.0.0.1:0",
             memory_limit=0,
+            silence_logs=logging.ERROR,  # an interrupt would have it warn of every case on its way
         ) as cluster,
         Client(cluster, set_as_default=False) as client,  # which another sweep must not take for the user's
     ):
