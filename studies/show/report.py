@@ -141,14 +141,15 @@ def table(result: xr.Dataset, sieve: float) -> str:
         return "no case holds a result"
     points = operating_points(result)
     parts = [
-        _points_table(result, points, found) for found in (figures(points, sieve), machine_figures(points)) if found
+        points_table(result, points, found) for found in (figures(points, sieve), machine_figures(points)) if found
     ]
     if result.sizes["replicate"] > 1:
         parts[-1] += f"\n(mean ± standard deviation of {result.sizes['replicate']} replicates)"
     return "\n\n".join(parts)
 
 
-def _points_table(result: xr.Dataset, points: xr.Dataset, found: dict[str, xr.DataArray]) -> str:
+def points_table(result: xr.Dataset, points: xr.Dataset, found: dict[str, xr.DataArray]) -> str:
+    """Return figures of operating points, by heading, as a table with the swept values before them."""
     along = (axis.name for dim in axes_of(result) for axis in swept(result, dim))
     columns = {axis_label(points[name]): _axis_texts(points[name]) for name in along}
     for heading, values in found.items():

@@ -29,7 +29,7 @@ def optimum_figure(best: "Optimum") -> Figure:
 def _tradeoff(panel, best: "Optimum", across: Quantity, up: Quantity) -> None:
     result = best.tradeoff
     unbeaten = result[f"best_{up.words.rpartition(' ')[2]}"].values.astype(bool)
-    for chosen, style in ((~unbeaten, {"color": "0.7", "label": "beaten by another"}), (unbeaten, _UNBEATEN)):
+    for chosen, style in ((~unbeaten, {"color": "0.7", "label": "another is finer and better"}), (unbeaten, _UNBEATEN)):
         x, y = ((result[one.plain].values[chosen], one.shown[1]) for one in (across, up))
         bars = (result[f"{one.plain}_error"].values[chosen] * one.shown[1] for one in (across, up))
         xerr, yerr = bars

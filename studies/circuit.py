@@ -1,0 +1,370 @@
+"""What a screen holds back, or the edge of the rolls, goes back to the feed: `python -m studies.circuit`.
+
+In the steady state the rolls take fresh feed f and recycle r, by size class and per unit of fresh feed; of their
+product the part o(f + r) goes back, and r = o(f + r). The machine sets how much it takes; the fresh feed follows.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import numpy as np
+from pydantic import ValidationError
+
+from hpgr.fields import Frozen, Metres, Number, faults_of, quantity, show
+from hpgr.laws.feed import TableFeed
+from hpgr.scene import Scene
+from studies import command as line
+from studies.command import Report, shown_as
+from studies.sweep.space import Space, axes_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+_SIEVES = np.round(10 ** (np.arange(241) / 40 - 6), 12)  # m, 40 a decade: between them distributions are log-linear
+_SIZES = np.sqrt(_SIEVES * np.append(_SIEVES[0] / 10, _SIEVES[:-1]))  # of the classes below them
+_MOST_LOAD = 20.0  # recycle over fresh feed beyond which the circuit is taken to fill up
+_MOST_ITERATIONS = 200
+_CONVERGED = 1e-9  # of the fresh feed, by which the recycle changes no more; where grains break at random, in cells:
+_CELLS = 10.0
+_KEPT = 12  # rounds that Anderson's acceleration (1965) combines; none where grains break at random: it feeds on noise
+
+
+class Screen(Frozen):
+    """Efficiency of a screen by Whiten's curve (Napier-Munn et al. 1996, section 12.4).
+
+    Examples
+    --------
+    >>> from studies.circuit import Screen
+    >>> Screen(cut_size="6 mm", sharpness=6, bypass=0.1).oversize([1e-6, 6e-3, 30e-3]).round(2)
+    array([0.1 , 0.55, 1.  ])
+    """
+
+    cut_size: Metres = quantity(symbol="d_50c", unit="m", source="screen", example="6 mm", ge=1e-6, le=1)
+    """Size of which half goes each way, but for the bypass"""
+    sharpness: Number = quantity(8.0, symbol="alpha", source="screen", example=8, ge=0.1, le=1000)
+    """Sharpness of the cut"""
+    bypass: Number = quantity(0.0, symbol="1 - C", source="screen", example=0.05, ge=0, le=0.9)
+    """Fraction of the fines that goes with the oversize"""
+
+    def oversize(self, size) -> np.ndarray:
+        """Return the fraction of grains of a size (m) that goes back."""
+        alpha, over = self.sharpness, np.asarray(size, float) / self.cut_size
+        grown = np.exp(np.minimum(alpha * (over - 1), 700.0))
+        return 1 - (1 - self.bypass) * (1 - math.exp(-alpha)) / (grown + 1 - 2 * math.exp(-alpha))
+
+    def split(self, scene: Scene, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Return what goes back and what leaves the circuit, by size class, of one unit of the rolls' product."""
+        product = _classes(values["passing_total"])
+        back = self.oversize(_SIZES) * product
+        return back, product - back
+
+
+class EdgeRecycle(Frozen):
+    """The product of the roll's edges goes back; the scene needs a roll width."""
+
+    def split(self, scene: Scene, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Return what goes back and what leaves the circuit, by size class, of one unit of the rolls' product."""
+        if scene.roll_width is None:
+            raise ValueError("roll_width: got none; edge recycle needs the product of the edges; give a roll_width")
+        slices = scene.roll_width.cut(scene.rolls.gap, scene.rolls.width)
+        share = float(slices.share[slices.at_edge].sum())
+        return (
+            share * _classes(values["passing_width_edge"]),
+            (1 - share) * _classes(values["passing_width_centre"]),
+        )
+
+
+class Closed(NamedTuple):
+    """The steady state of a circuit, by size class (mass between a sieve and the next finer) per unit of fresh feed."""
+
+    fresh: np.ndarray
+    back: np.ndarray
+    product: np.ndarray
+    values: Mapping[str, Any]
+    diagnostics: str
+    iterations: int
+    residual: float
+
+    @property
+    def load(self) -> float:
+        """Recycle over fresh feed."""
+        return float(self.back.sum())
+
+
+def _classes(passing) -> np.ndarray:
+    return np.diff(np.asarray(passing, float), prepend=0.0)
+
+
+def steady(scene: Scene, returned: Screen | EdgeRecycle, seed: int = 0, replicate: int = 0) -> Closed:
+    """Return the steady state of the circuit, `scene.feed` being its fresh feed.
+
+    Raises
+    ------
+    ValueError
+        If the recycle grows without end, or does not settle.
+    """
+    from hpgr.bed.loaded import Beds
+    from hpgr.run import run_scene
+
+    scene = scene.with_values({"resolution.sieves": _SIEVES.tolist(), "resolution.record": "product"})
+    if scene.resolution.cells == 0:
+        raise ValueError("resolution.cells: got 0; a circuit needs the product; give cells")
+    fresh, beds = _classes(scene.feed.passing(_SIEVES)), Beds(1)
+    inputs, outputs = [np.zeros(_SIEVES.size)], []
+    for iteration in range(1, _MOST_ITERATIONS + 1):
+        feed = fresh + inputs[-1]
+        result = run_scene(scene.with_values({"feed": _table(feed)}), seed, replicate, beds)
+        back, product = returned.split(scene, result.values)
+        outputs.append(back * feed.sum())
+        residual = float(np.abs(outputs[-1] - inputs[-1]).sum())
+        load = back.sum() / product.sum()
+        if load > _MOST_LOAD or inputs[-1].sum() > 2 * _MOST_LOAD:
+            raise ValueError(_diverges(back))
+        smooth = result.solver == "closed form"
+        if residual <= (_CONVERGED if smooth else _noise(scene, feed.sum())):
+            # the last product shared out: what goes in is what goes out
+            return Closed(
+                fresh, back * (1 + load), product * (1 + load), result.values, result.diagnostics, iteration, residual
+            )
+        kept = _KEPT if smooth else 1
+        inputs.append(np.maximum(_accelerated(inputs[-kept:], outputs[-kept:]), 0.0))
+    raise ValueError(
+        f"recycle: got a change of {residual:.2g} of the fresh feed after {iteration} rounds; must settle; give more "
+        "cells or streamlines"
+    )
+
+
+def _noise(scene: Scene, feed: float) -> float:
+    """Return the change of the recycle that is of a few cells, which may go on for ever."""
+    return _CELLS * feed / (scene.resolution.cells * scene.resolution.streamlines)
+
+
+def _diverges(back: np.ndarray) -> str:
+    coarse = show(float(_SIEVES[np.argmax(np.cumsum(back) >= 0.5 * back.sum())]), "m", 3)
+    return (
+        f"recycle: got more than {100 * _MOST_LOAD:.0f} % of the fresh feed, and it grows: half of it is coarser than "
+        f"{coarse}, and the rolls break too little of that; cut coarser, or press harder"
+    )
+
+
+def _table(mass: np.ndarray) -> TableFeed:
+    """Return masses by class as a feed."""
+    last = int(np.flatnonzero(mass)[-1])
+    percent = 100 * np.minimum(np.cumsum(mass[: last + 1]) / mass.sum(), 1.0)
+    percent[-1] = 100.0
+    first = max(int(np.argmax(percent > 0)) - 1, 0)
+    rows = list(zip(_SIEVES[first : last + 1].tolist(), percent[first:].tolist(), strict=True))
+    return TableFeed(table=rows if percent[first] == 0 else [(rows[0][0] / 1000, 0.0), *rows])
+
+
+def _accelerated(inputs: list[np.ndarray], outputs: list[np.ndarray]) -> np.ndarray:
+    """Return the next guess at the fixed point: the combination of what came out whose changes cancel best."""
+    changes = np.array(outputs) - inputs
+    if len(changes) == 1:
+        return outputs[-1]
+    steps = np.diff(changes, axis=0).T
+    weights = np.linalg.lstsq(steps, changes[-1], rcond=1e-10)[0]
+    return outputs[-1] - np.diff(np.array(outputs), axis=0).T @ weights
+
+
+# ---- what is told
+
+
+def close_circuit(
+    scene: Scene, returned: Screen | EdgeRecycle, space: Any = None, replicates: int = 1, seed: int = 0
+) -> "xr.Dataset":
+    """Return the steady state of a closed circuit, at each operating point of a space.
+
+    Parameters
+    ----------
+    scene : Scene
+        The machine; its feed is the circuit's fresh feed.
+    returned : Screen or EdgeRecycle
+        What goes back to the feed.
+    space : mapping or xarray.Dataset, optional
+        As `studies.sweep.sweep` takes it.
+    replicates, seed : int
+        As in `studies.sweep.sweep`.
+
+    Returns
+    -------
+    xarray.Dataset
+        Dims: of the space, replicate, sieve. Circulating load, fresh feed, energy per tonne of the circuit's product,
+        its P80; mass fractions passing of the rolls' feed and product, of the recycle and of the circuit's product; how
+        well the mass balance closes. A point whose load grows without end, or whose scene is refused, holds NaN.
+
+    Raises
+    ------
+    ValueError
+        If no point has a steady state.
+
+    Examples
+    --------
+    >>> import hpgr, studies
+    >>> from studies.circuit import Screen
+    >>> scene = hpgr.presets.industrial().with_values({"strength.cushioning": float("inf"), "resolution.points": 50})
+    >>> found = studies.close_circuit(scene, Screen(cut_size="10 mm"), {"press_force": ["3 N/mm^2", "5 N/mm^2"]})
+    >>> low, high = found["circulating_load"].values[:, 0]
+    >>> bool(low > high > 0)
+    True
+    """
+    from hpgr.results import schema
+    from studies.sweep.assemble import coordinates
+
+    space = Space(axes_of(space or {}), replicates)
+    told = [_told(scene, returned, case, seed) for case in space.cases()]
+    states, messages = zip(*told, strict=True)
+    held = [values for values in states if values]
+    if not held:
+        raise ValueError(messages[0])
+    own = {name: entry._replace(dims=(*space.dims, *entry.dims)) for name, entry in _variables().items()}
+    blank = {name: np.full(np.shape(value), np.nan) for name, value in held[0].items()} | {
+        "flags": 0,
+        "diagnostics": "",
+    }
+    values = {
+        name: np.reshape([(one or blank)[name] for one in states], (*space.shape, *np.shape(blank[name])))
+        for name in blank
+        if name != "sieve"
+    }
+    status = [schema.STATUS["ok" if one else "refused"] for one in states]
+    values |= {
+        "status": np.reshape(status, space.shape),
+        "message": np.reshape(np.array(messages, object), space.shape),
+    }
+    own |= {name: schema.SWEEP[name]._replace(dims=space.dims) for name in ("status", "message", "diagnostics")}
+    title = "Closed circuit of high pressure grinding rolls"
+    attrs = schema.dataset_attributes(title, scene=scene.model_dump_json(), returned=repr(returned), seed=seed)
+    found = schema.to_dataset(values | {"sieve": held[0]["sieve"]}, attrs, own)
+    return found.assign_coords(coordinates(space)).set_coords(["status", "message", "diagnostics"])
+
+
+def _told(scene: Scene, returned: Any, case: Any, seed: int) -> tuple[dict[str, Any], str]:
+    """Return the variables of one point, or none and why."""
+    try:
+        found = steady(scene.with_values(case.values), returned, seed, case.replicate)
+    except ValidationError as error:
+        return {}, faults_of(error)
+    except ValueError as error:
+        return {}, str(error)
+    return _figures(found), ""
+
+
+def _figures(found: Closed) -> dict[str, Any]:
+    """Return the variables of a steady state."""
+    sieves, load = np.array(found.values["sieve"]), found.load
+    feed = found.fresh + found.back
+    passing = {"feed_passing": feed, "recycle_passing": found.back, "product_passing": found.product}
+    shares = {name: np.cumsum(mass) / max(mass.sum(), 1e-300) for name, mass in passing.items()}
+    reach = np.log(sieves)[np.searchsorted(shares["product_passing"], 0.8) + np.array([-1, 0])]
+    parts = shares["product_passing"][np.searchsorted(shares["product_passing"], 0.8) + np.array([-1, 0])]
+    keep = ("throughput", "operating_gap", "specific_pressing_force", "power", "specific_energy", "flags")
+    return {
+        "sieve": sieves,
+        "circulating_load": load,
+        "fresh_feed": found.values["throughput"] / (1 + load),
+        "product_energy": found.values["specific_energy"] * (1 + load),
+        "product_p80": math.exp(np.interp(0.8, parts, reach)),
+        "mass_balance": found.fresh.sum() - found.product.sum(),
+        "residual": found.residual,
+        "iterations": found.iterations,
+        "rolls_passing": np.asarray(found.values["passing_total"], float),
+        **shares,
+        **{name: found.values[name] for name in keep if found.values.get(name) is not None},
+        "diagnostics": found.diagnostics,
+    }
+
+
+def _variables() -> dict[str, Any]:
+    from hpgr.results.schema import VARIABLES, Variable
+
+    per = "per unit of fresh feed"
+    sieve = ("sieve",)
+    return VARIABLES | {
+        "circulating_load": Variable((), "1", "circulating load", "recycle over fresh feed"),
+        "fresh_feed": Variable((), "kg s-1", "fresh feed", "and product of the circuit"),
+        "product_energy": Variable((), "J kg-1", "specific energy of the product", "power over product of the circuit"),
+        "product_p80": Variable((), "m", "P80 of the circuit's product"),
+        "mass_balance": Variable((), "1", "fresh feed less product", per, np.float64),
+        "residual": Variable((), "1", "change of the recycle in the last round", per, np.float64),
+        "iterations": Variable((), "1", "rounds of the recycle"),
+        "rolls_passing": Variable(sieve, "1", "mass fraction passing", "product of the rolls"),
+        "feed_passing": Variable(sieve, "1", "mass fraction passing", "feed of the rolls"),
+        "recycle_passing": Variable(sieve, "1", "mass fraction passing", "what goes back"),
+        "product_passing": Variable(sieve, "1", "mass fraction passing", "product of the circuit"),
+    }
+
+
+_SHOWN = {
+    "circulating_load": ("load [%]", 100.0),
+    "fresh_feed": ("fresh feed [t/h]", 3.6),
+    "throughput": ("rolls [t/h]", 3.6),
+    "product_p80": ("product P80 [mm]", 1e3),
+    "specific_energy": ("rolls [kWh/t]", 1 / 3600),
+    "product_energy": ("product [kWh/t]", 1 / 3600),
+    "iterations": ("rounds", 1.0),
+}
+
+
+def table(result: "xr.Dataset") -> str:
+    """Return a line for each operating point."""
+    from studies.show import report
+
+    points = report.operating_points(result)
+    found = {heading: points[name].astype(float) * factor for name, (heading, factor) in _SHOWN.items()}
+    return report.points_table(result, points, found)
+
+
+# ---- the command line
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of the closed circuit; sizes are text with a unit."""
+
+    cut: Annotated[str | None, shown_as("LENGTH")] = None
+    """Cut size of the screen, such as "6 mm"."""
+    sharpness: Annotated[float, shown_as("ALPHA")] = 8.0
+    """Sharpness of the cut, by Whiten's curve."""
+    bypass: Annotated[float, shown_as("PART")] = 0.0
+    """Part of the fines that goes with the oversize."""
+    edge_recycle: line.Flag = False
+    """Return the product of the roll's edges, in place of a screen's oversize."""
+    vary: line.Vary = ()
+    scene: line.SceneName = "industrial"
+    level: line.Level = None
+    cells: line.Cells = None
+    points: line.Points = None
+    streamlines: line.Streamlines = None
+    replicates: line.Replicates = 1
+    seed: line.Seed = 0
+    out: line.Out = Path("outputs/circuit.nc")
+    plot: line.Plot = True
+    overwrite: line.Overwrite = False
+
+
+@line.command("circuit", __doc__)
+def main(options: Options) -> Report:
+    """Write the steady state of the command line's circuit."""
+    if (options.cut is None) != options.edge_recycle:
+        raise ValueError("--cut: give a screen's cut size, or --edge-recycle; such as --cut '6 mm'")
+    screen = {"cut_size": options.cut, "sharpness": options.sharpness, "bypass": options.bypass}
+    returned = EdgeRecycle() if options.edge_recycle else Screen(**screen)
+    space = dict(line.varied(text) for text in options.vary)
+    result = close_circuit(line.base_scene(options), returned, space, options.replicates, options.seed)
+    from studies.show import report
+
+    def drawn() -> Any:
+        from studies.show.plots.circuit import circuit_figure
+
+        return circuit_figure(result)
+
+    lines = [table(result), *report.flagged(result)]
+    return Report(lines, [result, line.figure(drawn)], report.lost_cases(result))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
