@@ -276,6 +276,9 @@ def test_cases_of_a_driver_that_gives_no_sign_of_life_are_taken_over(tmp_path, m
         assert "last sign of life 0 s ago" in words
         old = time.time() - 2 * cases._SILENT_SECONDS
         os.utime(stopped._sign, (old, old))
+        assert list(stopped.read(A.__eq__)) == []  # at work again
+        assert not other.claim(A)
+        os.utime(stopped._sign, (old, old))
         assert other.claim(A)
         assert other.claim(B)
         stopped.put(A, result(1))  # it was not dead after all

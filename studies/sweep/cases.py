@@ -302,7 +302,7 @@ class CaseFolder:
         self._waiting: list[bytes] = []
         self._waiting_bytes, self._waiting_held, self._flushed = 0, set(), time.monotonic()
         self._drivers: list[Driver] = []
-        self._signed = -math.inf
+        self._signed = self._looked = -math.inf
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._lock = os.open(self.folder / "lock", os.O_RDWR | os.O_CREAT, 0o666)
@@ -333,7 +333,13 @@ class CaseFolder:
             os.close(self._lock)  # and with it every lock
 
     def read(self, wanted: Callable[[str], bool]) -> Iterator[Found]:
-        """Yield the records of wanted addresses that were not read before; cheap if the folder has not changed."""
+        """Yield the records of wanted addresses that were not read before; cheap if the folder has not changed.
+
+        Called again and again, this is also the driver's sign of life.
+        """
+        if time.monotonic() - self._signed > _SIGN_SECONDS:
+            self._signed = time.monotonic()
+            os.utime(self._sign)
         changed = self.folder.stat().st_mtime_ns
         if changed == self._scanned:
             return
@@ -353,9 +359,9 @@ class CaseFolder:
         return True
 
     def _look(self) -> list[Driver]:
-        """Return the other drivers, as they were a second ago at most, and give a sign of life."""
-        if time.monotonic() - self._signed > _SIGN_SECONDS:
-            self._signed = time.monotonic()
+        """Return the other drivers, as they were a second ago at most."""
+        if time.monotonic() - self._looked > _SIGN_SECONDS:
+            self._looked = time.monotonic()
             os.utime(self._sign)
             now = self._sign.stat().st_mtime  # by the clock of the file system, which drivers share
             signs = (path for path in self.folder.glob(".hpgr-*.driver") if path != self._sign)
