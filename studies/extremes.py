@@ -5,7 +5,6 @@ and random scenes, checks each result against `studies.guard.invariants`, and ma
 """
 
 import json
-import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,19 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 from pydantic import ValidationError
 
 from hpgr import cost
-from studies.command import (
-    Out,
-    Overwrite,
-    Plot,
-    Quick,
-    Report,
-    Seed,
-    beside,
-    command,
-    figure,
-    progress_bar,
-    shown_as,
-)
+from studies.command import Out, Overwrite, Plot, Quick, Report, Seed, beside, command, figure, progress_bar, shown_as
 from studies.guard import maps, ranges
 from studies.guard.judge import KINDS, Outcome, as_wanted, base, catalogue, hosts, judge
 
@@ -139,45 +126,20 @@ def _cheap(values: dict[str, Any]) -> bool:
 
 
 def dataset(walked: Sequence[Walked], mapped: "xr.Dataset", seed: int = 0) -> "xr.Dataset":
-    """Return every scene of the walk along `scene`, with the values set in it, beside the maps."""
-    import numpy as np
+    """Return every scene of the walk along `scene`, beside the maps."""
+    from hpgr.results import schema
 
-    from hpgr.results import flags, schema
-    from hpgr.scene import field_info
-
-    fields, kinds = list(ranges.numeric_fields()), [KINDS.index(each.outcome.kind) for each in walked]
-    own = {
-        "part": schema.Variable(("scene",), "", "part of the walk", dtype=None),
-        "name": schema.Variable(("scene",), "", "what was set", dtype=None),
-        "message": schema.Variable(("scene",), "", "flags, refusal or fault", dtype=None),
-        "outcome": schema.Variable(("scene",), "1", "how the scene ended", "", np.int8, maps.outcome_meanings()),
-        "substeps": schema.Variable(("scene",), "1", "exchange substeps per time step", dtype=np.int32),
-        "flags": schema.Variable(("scene",), "1", "limits that were hit", "", np.int32, flags.ATTRIBUTES),
-        "field": schema.Variable(("field",), "", "scene field", dtype=None),
-        "field_units": schema.Variable(("field",), "", "unit of its values", dtype=None),
-        "value": schema.Variable(("scene", "field"), "", "value set", "NaN where the base scene's was kept"),
+    values, own = maps.outcome_variables("", ("scene",), [each.outcome for each in walked], (len(walked),))
+    texts = {
+        "part": ("part of the walk", [each.part for each in walked]),
+        "name": ("what was set", [each.name for each in walked]),
+        "values": ("values of the scene", [json.dumps(each.values) for each in walked]),
+        "message": ("flags, refusal or fault", [each.outcome.message for each in walked]),
     }
-    drawn = np.array([[_number(each.values.get(name)) for name in fields] for each in walked], float)
-    values = {
-        "part": [each.part for each in walked],
-        "name": [each.name for each in walked],
-        "message": [each.outcome.message for each in walked],
-        "outcome": kinds,
-        "substeps": [each.outcome.substeps for each in walked],
-        "flags": [each.outcome.flags for each in walked],
-        "field": fields,
-        "field_units": [field_info(name).unit for name in fields],
-        "value": drawn.reshape(-1, len(fields)),
-    }
+    own |= {name: schema.Variable(("scene",), "", words, dtype=None) for name, (words, _) in texts.items()}
+    values |= {name: each for name, (_, each) in texts.items()}
     attrs = schema.dataset_attributes("Numerical extremes: outcomes and stability maps", seed=seed)
     return schema.to_dataset(values, attrs, own).merge(mapped)
-
-
-def _number(value: Any) -> float:
-    """Return a value that a float32 of the file can hold; NaN for what is none."""
-    if not isinstance(value, int | float):
-        return math.nan
-    return value if math.isinf(value) else min(max(value, -3e38), 3e38)
 
 
 def faulty(walked: Sequence[Walked]) -> list[str]:
@@ -195,27 +157,18 @@ def table(result: "xr.Dataset") -> str:
     from studies.show.report import aligned
 
     kinds, parts, bits = (result[name].values for name in ("outcome", "part", "flags"))
-    counts = [
-        [kinds[parts == part].size, *((kinds[parts == part] == k).sum() for k in range(len(KINDS)))] for part in PARTS
-    ]
+    counts = (
+        [kinds[parts == part].size, *(((parts == part) & (kinds == k)).sum() for k in range(5))] for part in PARTS
+    )
     rows = [[part, *map(str, row)] for part, row in zip(PARTS, counts, strict=True)]
     messages = result["message"].values[kinds == KINDS.index("refused")]
     refused = Counter(str(message).partition(": ")[0] for message in messages)
     flagged = Counter({name: int((bits & bit > 0).sum()) for name, bit in flags.BITS.items()})
-    substeps = result["substeps"].values[kinds == KINDS.index("substepped")]
-    return "\n".join(
-        [
-            aligned(["part", "scenes", *KINDS], rows, words=1),
-            "",
-            f"refused for: {_listed(refused)}",
-            f"flagged with: {_listed(flagged)}",
-            f"substepped: {substeps.size} scenes, up to {substeps.max(initial=0)} substeps per time step",
-        ]
-    )
-
-
-def _listed(counts: Counter) -> str:
-    return ", ".join(f"{name} {count}" for name, count in counts.most_common() if count) or "none"
+    told = {"refused for": refused, "flagged with": flagged}
+    listed = {words: ", ".join(f"{name} {n}" for name, n in each.most_common() if n) for words, each in told.items()}
+    lines = [f"{words}: {each or 'none'}" for words, each in listed.items()]
+    most = f"exchange substeps per time step: up to {result['substeps'].values.max(initial=0)}"
+    return "\n".join([aligned(["part", "scenes", *KINDS], rows, words=1), "", *lines, most])
 
 
 if __name__ == "__main__":

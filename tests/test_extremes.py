@@ -10,7 +10,6 @@ from support import sized
 import hpgr
 from hpgr import cost
 from hpgr.fields import Frozen, Metres, quantity
-from hpgr.results.flags import BITS
 from hpgr.scene import field_value
 from studies import extremes
 from studies.guard import judge, maps, ranges
@@ -41,9 +40,10 @@ def test_catalogue(row):
 def test_an_outcome_that_is_not_the_wanted_one_is_a_fault():
     assert {row.wanted for row in judge.catalogue()} == set(KINDS) - {"fault"}
     found = judge.judge({})
-    assert found == Outcome("ok", BITS["unusual_machine"], message="unusual_machine")  # no limit of the model
+    assert found.kind == "ok"
+    assert set(found.message.split(", ")) <= judge.NO_LIMITS
     assert as_wanted(Row("as it is", {}, "ok"), found) == found
-    for row in (Row("refused?", {}, "refused"), Row("said?", {}, "ok", ("no_breakage",))):
+    for row in (Row("refused?", {}, "refused"), Row("said?", {}, "ok", "no_breakage")):
         assert as_wanted(row, found).kind == "fault"
 
 
@@ -198,13 +198,13 @@ def test_random_scenes_end_well_flagged_or_refused(number):
 @pytest.fixture
 def small(tmp_path, monkeypatch):
     """A study of seconds in an empty folder: few scenes, small maps."""
-    steps = maps.Axis("resolution.points", (2, 9))
+    steps = {"resolution.points": (2, 9)}
     small = {
-        "gap_speed": (maps.Axis("rolls.gap", (0.0, 0.03, 0.5)), maps.Axis("rolls.speed", (1.0, 2e6))),
-        "cushioning_step": (maps.Axis("strength.cushioning", (1.0, INF)), steps),
-        "exponent_step": (maps.Axis("elasticity.exponent", (-1.0, 0.5)), steps),
+        "gap_speed": {"rolls.gap": (0.0, 0.03, 0.5), "rolls.speed": (1.0, 2e6)},
+        "cushioning_step": {"strength.cushioning": (1.0, INF)} | steps,
+        "exponent_step": {"elasticity.exponent": (-1.0, 0.5)} | steps,
     }
-    values = {"MAPS": small, "_EXPONENTS": (-0.5, 0.5), "_STEPS": (10, 160), "_ENTRY_GAPS": (0.5, 1.14), "_FINEST": 640}
+    values = {"MAPS": small, "_EXPONENTS": (-0.5, 0.5), "_STEPS": (10, 160), "_FINEST": 640}
     for name, value in values.items():
         monkeypatch.setattr(maps, name, value)
     maps._limit.cache_clear()
@@ -236,7 +236,7 @@ def test_study(small, capsys):
     assert [KINDS[kind] for kind in result["outcome"].values[:4]] == ["ok", "flagged", "refused", "substepped"]
     assert result["message"].values[2].startswith("rolls.gap: got 0 mm; must be at least 0.001 mm; give")
     assert result["substeps"].values[3] > 1
-    assert result["value"].sel(field="rolls.gap").values[-3:].tolist() == pytest.approx([0.05, 0.06, 0.07])
+    assert json.loads(str(result["values"].values[-1])) == {"rolls.gap": 0.07}
     assert (result["gap_speed_outcome"].sel(gap_speed_speed=2e6) == KINDS.index("refused")).all()
 
 
@@ -264,22 +264,22 @@ def test_maps_and_their_figures(small):
     kinds = [KINDS[kind] for kind in result["gap_speed_outcome"].sel(gap_speed_speed=1.0).values]
     assert kinds == ["refused", "substepped", "flagged"]
     assert maps.faults(result) == 0
-    error = result["integrator_step_error"]
+    error = result["integrator_error"]
     euler, increment = (error.sel(integrator=name, exponent=0.5).values for name in maps.INTEGRATORS)
     assert euler[1] < 0.1 < euler[0]
     assert increment[1] < 0.2 * euler[1]  # second order against first
-    assert result["integrator_step_settled"].sel(exponent=0.5).values.all()
-    assert not result["integrator_step_settled"].sel(exponent=-0.5).values.any()
-    assert result["integrator_step_tension"].sel(exponent=-0.5, steps=160).values.all()
-    assert result["strain"].values == pytest.approx([0.39, 1.03], abs=0.05)
+    assert result["integrator_settled"].sel(exponent=0.5).values.all()
+    assert not result["integrator_settled"].sel(exponent=-0.5).values.any()
+    assert result["integrator_tension"].sel(exponent=-0.5, steps=160).values.all()
     figure = plots.stability(result)
-    titles = [axes.get_title() for axes in figure.axes]
-    assert titles == ["Gap and roll speed", "Cushioning and time step", "Elastic exponent and time step"]
     written = {text.get_text() for axes in figure.axes for text in axes.texts}
     assert "×" in written
     assert any("CN" in text for text in written)
-    assert figure.axes[0].get_xlabel() == "gap [mm]"
-    assert figure.axes[1].get_ylabel() == "time step dt [residence times]"
+    labels = [(axes.get_xlabel(), axes.get_ylabel()) for axes in figure.axes]
+    assert labels[0] == ("rolls gap [mm]", "rolls speed [rpm]")
+    assert labels[2] == ("exponent c [-]", "time step dt [-]")
     figure = plots.integrators(result)
     assert figure.axes[0].get_title() == "Euler, the paper's explicit rule"
-    assert {f"{100 * euler[0]:.0f}", "T"} <= {text.get_text() for text in figure.axes[0].texts}
+    written = "".join(text.get_text() for text in figure.axes[0].texts)
+    assert f"{100 * euler[0]:.2g}" in written
+    assert "no limit\nT" in written

@@ -26,40 +26,30 @@ _LETTERS = {  # flag -> letter in a map, and its meaning
 }
 _SHADES = ("white", "0.86", "0.68", "0.35", "black")  # ok, flagged, substepped, refused, fault
 _WORDS = ("·  ok", "flagged (letters)", "substepped (number of substeps, letters)", "×  refused", "!  silent fault")
-_TITLES = {
-    "gap_speed": "Gap and roll speed",
-    "cushioning_step": "Cushioning and time step",
-    "exponent_step": "Elastic exponent and time step",
-}
 _ERROR_LEVELS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, np.inf)
+_ERROR_SHADES = [str(round(shade, 3)) for shade in np.linspace(1.0, 0.1, len(_ERROR_LEVELS) - 1)]
+_NAMES = {
+    "resolution.points": "time step dt",
+    "strength.cushioning": "cushioning n",
+    "elasticity.exponent": "exponent c",
+}
 
 
 def stability(result: xr.Dataset) -> Figure:
-    """Return the maps of outcomes, a panel each.
-
-    Parameters
-    ----------
-    result : xarray.Dataset
-        From `studies.guard.maps.maps`.
-    """
-    names = [name for name in _TITLES if f"{name}_outcome" in result]
+    """Return the maps of outcomes of `studies.guard.maps.maps`, a panel each."""
+    names = [name.removesuffix("_outcome") for name in result if name.endswith("_outcome")]
     figure = Figure(figsize=(6.2 * len(names), 7.4), layout="constrained")
     seen: set[str] = set()
     for panel, name in zip(np.atleast_1d(figure.subplots(1, len(names))), names, strict=True):
         seen |= _outcomes(panel, result, name)
-    patches = [
-        Patch(facecolor=shade, edgecolor="black", label=words)
-        for kind, (shade, words) in enumerate(zip(_SHADES, _WORDS, strict=True))
-        if kind < 4 or any((result[f"{name}_outcome"] == kind).any() for name in names)
-    ]
+    faulty = any((result[f"{name}_outcome"] == 4).any() for name in names)
+    shown = list(zip(_SHADES, _WORDS, strict=True))[: 5 if faulty else 4]
+    patches = [Patch(facecolor=shade, edgecolor="black", label=words) for shade, words in shown]
     figure.legend(handles=patches, loc="outside upper center", ncols=len(patches), fontsize=10)
     letters = ", ".join(f"{letter}: {meaning}" for letter, meaning in _LETTERS.values() if letter in seen)
     figure.supxlabel(
         f"Letters: {letters}. Refused: outside the range of the field, or too many substeps.\n"
-        "Paper's rolls with a bed that begins at a gap of 500 mm; segregation and mixing on. Narrow gaps and small "
-        "time steps bring points closer together: exchange then takes more substeps, and below 1 mm too many.\nRoll "
-        "speed changes no outcome. Steps of 1/8 and longer miss the compaction near the gap. Exponents below 0 ask for "
-        "tension at its onset once steps are small enough to see it. No scene ends without a word.",
+        "Paper's rolls with a bed that begins at a gap of 500 mm; exchange on. Time steps in residence times.",
         fontsize=10,
     )
     return figure
@@ -68,132 +58,67 @@ def stability(result: xr.Dataset) -> Figure:
 def _outcomes(panel, result: xr.Dataset, name: str) -> set[str]:
     """Draw one map of outcomes; return the letters in it."""
     outcome, bits, substeps = (result[f"{name}_{part}"] for part in ("outcome", "flags", "substeps"))
-    columns, rows = (result[dim] for dim in outcome.dims)
-    panel.imshow(outcome.values.T, cmap=ListedColormap(_SHADES), vmin=-0.5, vmax=4.5, origin="lower", aspect="auto")
-    seen: set[str] = set()
-    for i, j in np.ndindex(outcome.shape):
-        kind, said = int(outcome[i, j]), int(bits[i, j])
-        letters = "".join(_LETTERS[name][0] for name in flags.names(said) if name in _LETTERS)
+    texts, seen = np.empty(outcome.shape, object), set()
+    for place in np.ndindex(outcome.shape):
+        kind = int(outcome[place])
+        letters = "".join(_LETTERS[flag][0] for flag in flags.names(int(bits[place])) if flag in _LETTERS)
         seen |= set(letters)
-        number = str(int(substeps[i, j])) if kind == 2 else ""
-        text = {0: "·", 3: "×", 4: "!"}.get(kind, "\n".join(filter(None, (number, letters))))
-        panel.text(
-            i,
-            j,
-            text,
-            ha="center",
-            va="center",
-            fontsize=7.5,
-            color="white" if kind >= 3 else "black",
-            linespacing=0.95,
-        )
+        number = str(int(substeps[place])) if kind == 2 else ""
+        texts[place] = {0: "·", 3: "×", 4: "!"}.get(kind, "\n".join(filter(None, (number, letters))))
+    columns, rows = (result[dim] for dim in outcome.dims)
+    _cells(panel, outcome.values, _SHADES, texts, dark=3)
     panel.set_xticks(np.arange(columns.size), _ticks(columns), rotation=90)
     panel.set_yticks(np.arange(rows.size), _ticks(rows))
-    panel.set(title=_TITLES[name], xlabel=_label(columns), ylabel=_label(rows))
-    _grid(panel, outcome.shape)
+    panel.set(xlabel=_label(columns), ylabel=_label(rows))
     return seen
 
 
-def integrators(result: xr.Dataset) -> Figure:
-    """Return the errors of the explicit rule beside those of the increments, over exponent, time step and strain.
-
-    Parameters
-    ----------
-    result : xarray.Dataset
-        From `studies.guard.maps.maps`.
-    """
-    figure = Figure(figsize=(13, 10.5), layout="constrained")
-    panels = figure.subplots(2, 2, sharex=True)
-    titles = {"euler": "Euler, the paper's explicit rule", "increment": "Increments of the state functions"}
-    for column, integrator in zip(panels.T, result["integrator"].values, strict=True):
-        for panel, name in zip(column, ("step", "strain"), strict=True):
-            _errors(panel, result.sel(integrator=integrator), name)
-        column[0].set_title(titles[str(integrator)])
-        column[1].set_xlabel("elastic exponent c [-]")
-    for panel in panels[:, 0]:
-        panel.set_ylabel(panel.get_label())
-    percents = [f"{100 * level:g}" for level in _ERROR_LEVELS[:-1]]
-    bounds = [f"{low} to {high} %" for low, high in pairwise(percents)] + [f"above {percents[-1]} %"]
-    shades = _error_shades()
-    patches = [
-        Patch(facecolor=shade, edgecolor="black", label=text) for shade, text in zip(shades, bounds, strict=True)
-    ]
-    patches.append(Patch(facecolor="white", edgecolor="black", hatch="////", label="no limit of small steps"))
-    figure.legend(handles=patches, loc="outside upper center", ncols=len(patches), fontsize=9)
-    figure.supxlabel(
-        "Largest error of pressure at a material point [% of the largest pressure], against increments at 6,400 time "
-        "steps. T: tension or reverse shear held at 0, flagged.\nHatched: the pressure has no limit: from 3,200 to "
-        "6,400 steps it still changes by over 2 %; with exponents below 0 it grows with the number of steps.\n"
-        "Paper's rolls; upper row: its bed (entry gap 1,140 mm); lower row: 40 time steps.",
-        fontsize=10,
-    )
-    return figure
-
-
-def _error_shades() -> list[str]:
-    return [str(round(shade, 3)) for shade in np.linspace(1.0, 0.1, len(_ERROR_LEVELS) - 1)]
-
-
-def _errors(panel, result: xr.Dataset, name: str) -> None:
-    """Draw the error of one integrator over exponent and time step, or exponent and strain."""
-    error = result[f"integrator_{name}_error"].values
-    tension, settled = (result[f"integrator_{name}_{part}"].values for part in ("tension", "settled"))
-    level = np.clip(np.searchsorted(_ERROR_LEVELS, error, side="right") - 1, 0, len(_ERROR_LEVELS) - 2)
-    shades = _error_shades()
-    panel.imshow(level.T, cmap=ListedColormap(shades), vmin=-0.5, vmax=len(shades) - 0.5, origin="lower", aspect="auto")
-    for i, j in np.ndindex(error.shape):
-        text, ink = "T" if tension[i, j] else "", "white" if level[i, j] >= 4 else "black"
-        if settled[i, j]:
-            text = f"{_percent(error[i, j])}\n{text}".strip()
-        else:
-            panel.fill(
-                [i - 0.5, i + 0.5, i + 0.5, i - 0.5],
-                [j - 0.5, j - 0.5, j + 0.5, j + 0.5],
-                facecolor="white",
-                hatch="///",
-                edgecolor="0.6",
-                linewidth=0,
-            )
-            ink = "black"
-        panel.text(i, j, text, ha="center", va="center", fontsize=8, color=ink, linespacing=0.95)
-    exponents = result["exponent"].values
-    panel.set_xticks(np.arange(exponents.size), [f"{c:g}" for c in exponents])
-    if name == "step":
-        panel.set_yticks(np.arange(error.shape[1]), [f"1/{steps}" for steps in result["steps"].values])
-        panel.set_label("time step dt [residence times]")
-    else:
-        pairs = zip(result["strain"].values, result["entry_gap"].values, strict=True)
-        panel.set_yticks(np.arange(error.shape[1]), [f"{strain:.2g}\n({1e3 * gap:g} mm)" for strain, gap in pairs])
-        panel.set_label("largest volumetric strain [-] (entry gap)")
-    _grid(panel, error.shape)
-
-
-def _percent(error: float) -> str:
-    return f"{100 * error:.0f}" if error >= 0.0995 else f"{100 * error:.1f}"
-
-
-def _grid(panel, shape: tuple[int, int]) -> None:
-    panel.set_xticks(np.arange(shape[0] + 1) - 0.5, minor=True)
-    panel.set_yticks(np.arange(shape[1] + 1) - 0.5, minor=True)
+def _cells(panel, level: np.ndarray, shades, texts: np.ndarray, dark: int) -> None:
+    """Draw a map of levels as shades with texts, which are white from level `dark` on."""
+    style = {"cmap": ListedColormap(shades), "vmin": -0.5, "vmax": len(shades) - 0.5}
+    panel.imshow(level.T, origin="lower", aspect="auto", **style)
+    for i, j in np.ndindex(level.shape):
+        ink = "white" if level[i, j] >= dark else "black"
+        panel.text(i, j, texts[i, j], ha="center", va="center", fontsize=7.5, color=ink, linespacing=0.95)
+    panel.set_xticks(np.arange(level.shape[0] + 1) - 0.5, minor=True)
+    panel.set_yticks(np.arange(level.shape[1] + 1) - 0.5, minor=True)
     panel.grid(which="minor", color="0.5", linewidth=0.5)
     panel.tick_params(which="minor", length=0)
 
 
 def _ticks(axis: xr.DataArray) -> list[str]:
     if axis.attrs["scene_field"] == "resolution.points":
-        return [f"1/{int(points) - 1}" if points > 2 else "1" for points in axis.values]
-    factor = unit_shown(axis.attrs["units"])[1]
-    return [f"{value * factor:.3g}" for value in axis.values]
+        return [f"1/{int(points) - 1}" for points in axis.values]
+    return [f"{value * unit_shown(axis.attrs['units'])[1]:.3g}" for value in axis.values]
 
 
 def _label(axis: xr.DataArray) -> str:
-    if axis.attrs["scene_field"] == "resolution.points":
-        return "time step dt [residence times]"
-    shown = unit_shown(axis.attrs["units"])[0]
-    words = {
-        "strength.cushioning": "cushioning constant n",
-        "elasticity.exponent": "elastic exponent c",
-        "rolls.gap": "gap",
-        "rolls.speed": "roll speed",
-    }[axis.attrs["scene_field"]]
-    return f"{words} [{'-' if shown == '1' else shown}]"
+    field, shown = axis.attrs["scene_field"], unit_shown(axis.attrs["units"])[0]
+    return f"{_NAMES.get(field, field.replace('.', ' '))} [{'-' if shown == '1' else shown}]"
+
+
+def integrators(result: xr.Dataset) -> Figure:
+    """Return the errors of the paper's explicit rule beside those of the increments, over exponent and time step."""
+    figure = Figure(figsize=(13, 6), layout="constrained")
+    titles = {"euler": "Euler, the paper's explicit rule", "increment": "Increments of the state functions"}
+    for panel, integrator in zip(figure.subplots(1, 2, sharey=True), result["integrator"].values, strict=True):
+        one = result.sel(integrator=integrator)
+        error, tension, settled = (one[f"integrator_{part}"].values for part in ("error", "tension", "settled"))
+        level = np.clip(np.searchsorted(_ERROR_LEVELS, error, side="right") - 1, 0, len(_ERROR_SHADES) - 1)
+        told = np.where(settled == 1, [[f"{100 * e:.2g}\n" for e in row] for row in error], "no limit\n")
+        texts = np.char.add(told, np.where(tension == 1, "T", ""))
+        _cells(panel, np.where(settled == 1, level, 0), _ERROR_SHADES, texts, dark=4)
+        panel.set_xticks(np.arange(level.shape[0]), [f"{c:g}" for c in one["exponent"].values])
+        panel.set_yticks(np.arange(level.shape[1]), [f"1/{steps}" for steps in one["steps"].values])
+        panel.set(title=titles[str(integrator)], xlabel="exponent c [-]", ylabel="time step dt [residence times]")
+    percents = [f"{100 * level:g}" for level in _ERROR_LEVELS[:-1]]
+    bounds = [f"{low} to {high} %" for low, high in pairwise(percents)] + [f"above {percents[-1]} %"]
+    patches = [Patch(facecolor=s, edgecolor="black", label=b) for s, b in zip(_ERROR_SHADES, bounds, strict=True)]
+    figure.legend(handles=patches, loc="outside upper center", ncols=len(patches), fontsize=9)
+    figure.supxlabel(
+        "Largest error of pressure at a material point [% of the largest pressure], against increments at 6,400 time "
+        "steps on the paper's bed. T: tension or reverse shear held at 0, flagged.\nNo limit: from 3,200 to 6,400 "
+        "steps the pressure still changes by over 2 %; with exponents below 0 it grows with the number of steps.",
+        fontsize=10,
+    )
+    return figure
