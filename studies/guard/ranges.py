@@ -33,16 +33,14 @@ class Range(NamedTuple):
     def ends(self) -> list[float]:
         """Return the lowest and highest value that are allowed, and inf where it is."""
         low = self._next(self.low, math.inf) if self.low_open else self.low
-        high = self._next(self.high, -math.inf) if self.high_open else self.high
-        ends = [low, high if math.isfinite(high) else 1e300, *([math.inf] if self.infinite else [])]
-        return [int(end) if self.whole else end for end in ends]
+        high = self._next(self.high, -math.inf) if self.high_open else min(self.high, 1e300)
+        return [int(end) if self.whole else end for end in (low, high)] + [math.inf] * self.infinite
 
     def outside(self) -> list[float]:
         """Return the values nearest to the ends that are not allowed."""
-        beyond = [self.low if self.low_open else self._next(self.low, -math.inf)]
-        if math.isfinite(self.high):
-            beyond.append(self.high if self.high_open else self._next(self.high, math.inf))
-        return [int(value) if self.whole else value for value in beyond]
+        low = self.low if self.low_open else self._next(self.low, -math.inf)
+        high = self.high if self.high_open else self._next(self.high, math.inf)
+        return [int(value) if self.whole else value for value in (low, high) if math.isfinite(value)]
 
     def at(self, place: float) -> float:
         """Return the value at `place`, 0 to 1, along the range: in the logarithm where it spans decades."""
@@ -51,11 +49,9 @@ class Range(NamedTuple):
             high = max(low, 1.0) * 10**_DECADES
         if self.low < 0 or high <= 100 * self.low:
             value = low + place * (high - low)
-        elif place == 0:
-            value = low
         else:
             start = low if self.low > 0 else high / 10**_DECADES
-            value = start * (high / start) ** place
+            value = start * (high / start) ** place if place else low
         value = min(max(value, low), high)
         return round(value) if self.whole else value
 
@@ -77,58 +73,42 @@ def laws() -> dict[str, list[type[Frozen]]]:
 @cache
 def numeric_fields() -> dict[str, Range]:
     """Return the range of every field that holds one number, by dotted name."""
-    found = {name: _range(field) for name, field in _fields().items() if _holds(field, float) or _holds(field, int)}
+    found = {name: _range(field) for name, field in _fields().items()}
     return {name: known for name, known in found.items() if known is not None}
 
 
 @cache
 def choices() -> dict[str, tuple]:
     """Return the words or truth values of every field that is a choice, by dotted name; kinds of laws are one."""
-    found = {
-        f"{section}.kind": tuple(kind for law in each for kind in kinds_of(law)) for section, each in laws().items()
-    }
+    found = {f"{name}.kind": tuple(kind for law in each for kind in kinds_of(law)) for name, each in laws().items()}
     for name, field in _fields().items():
         if field.annotation is bool:
             found[name] = (False, True)
-        elif get_origin(field.annotation) is Literal and not name.endswith(".kind"):
-            found[name] = get_args(field.annotation)
+        elif get_origin(field.annotation) is Literal:
+            found.setdefault(name, get_args(field.annotation))
     return {name: words for name, words in found.items() if words}
 
 
 def _fields() -> dict[str, Any]:
-    every = [
-        (f"{name}.{key}", field)
-        for name, each in laws().items()
-        for law in each
-        for key, field in law.model_fields.items()
-    ]
-    return dict(reversed(every))  # of a name that several laws of a section have, the first
-
-
-def _holds(field: Any, kind: type) -> bool:
-    """Return whether a field holds one number of this kind, be it optional."""
-    if get_origin(field.annotation) is tuple:
-        return False
-    held = [each for each in (field.annotation, *get_args(field.annotation)) if get_origin(each) is not tuple]
-    return any(each is kind or kind in get_args(each)[:1] for each in held)
+    found: dict[str, Any] = {}
+    for name, each in laws().items():
+        for law in each:
+            for key, field in law.model_fields.items():
+                found.setdefault(f"{name}.{key}", field)  # of several laws of a section, the first
+    return found
 
 
 def _range(field: Any) -> Range | None:
-    known = {}
-    for key in ("gt", "ge", "lt", "le", "allow_inf_nan"):
-        found = [getattr(bound, key) for bound in field.metadata if getattr(bound, key, None) is not None]
-        known |= dict.fromkeys([key], found[0]) if found else {}
-    if not {"gt", "ge"} & known.keys():
+    keys = ("gt", "ge", "lt", "le", "allow_inf_nan")
+    known = {
+        key: getattr(bound, key) for bound in field.metadata for key in keys if getattr(bound, key, None) is not None
+    }
+    inner = {each for kind in (field.annotation, *get_args(field.annotation)) for each in (kind, *get_args(kind)[:1])}
+    if get_origin(field.annotation) is tuple or not {"gt", "ge"} & known.keys():
         return None
-    return Range(
-        low=float(known.get("gt", known.get("ge"))),
-        high=float(known.get("lt", known.get("le", math.inf))),
-        low_open="gt" in known,
-        high_open="lt" in known,
-        whole=_holds(field, int),
-        infinite=bool(known.get("allow_inf_nan")),
-        optional=type(None) in get_args(field.annotation),
-    )
+    low, high = known.get("gt", known.get("ge")), known.get("lt", known.get("le", math.inf))
+    opened, infinite, optional = ("gt" in known, "lt" in known), "allow_inf_nan" in known, type(None) in inner
+    return Range(float(low), float(high), *opened, int in inner, infinite, optional)
 
 
 # --- random scenes --------------------------------------------------------------------------------------------------
