@@ -88,23 +88,9 @@ def study(
 ) -> "xr.Dataset":
     """Return everything the figures and the animation show, labelled, in SI units.
 
-    Parameters
-    ----------
-    scene : Scene
-        What is simulated, at its own resolution and, if it has a pressing force, at the gap that carries it.
-    shown_points : int
-        Material points per streamline where single ones are drawn: figures 3c, 3d and the start-up.
-    seed : int
-        Seed of all randomness.
-    animation, assumptions : bool
-        Whether the start-up is simulated, and the scene with other assumptions.
-
-    Returns
-    -------
-    xarray.Dataset
-        Fields over (streamline, point), the left roll to the right one, mid-plane and outermost streamlines
-        included; shown points and their volumes; products over (product_streamline, sieve), the mid-plane to the
-        roll; `startup_p80` over snapshots; pressures and P80 by assumption.
+    Fields are over (streamline, point), the left roll to the right one, mid-plane and outermost streamlines included;
+    products over (product_streamline, sieve), the mid-plane to the roll. Where single points are drawn, figures 3c,
+    3d and the start-up, there are `shown_points` on a streamline.
 
     Raises
     ------
@@ -129,7 +115,7 @@ def study(
     scene = floated.with_values({"rolls.specific_pressing_force": None})
     shown = scene.with_values({"resolution.points": shown_points})
     values, told = _product(scene, seed)
-    values |= _rolls(scene) | _fields(scene) | _shown(shown)
+    values |= _fields(scene) | _shown(shown)
     values |= _startup(shown, seed) if animation else {}
     values |= _assumptions(scene, seed) if assumptions else {}
     attrs = schema.dataset_attributes(
@@ -149,40 +135,39 @@ def _own() -> dict[str, Any]:
 
     from hpgr.results.schema import Variable
 
-    field, place, corner = ("streamline", "point"), ("shown_streamline", "shown_point"), ("corner",)
-    product, frame, variant = ("product_streamline",), ("snapshot",), ("variant",)
+    place, product = ("shown_streamline", "shown_point"), ("product_streamline",)
     whole = partial(Variable, dtype=None)
-    across = "across the gap, negative on the left"
-    table = {
+    point, corner, variant = partial(whole, place), partial(whole, ("corner",)), partial(whole, ("variant",))
+    frame, left = partial(whole, ("snapshot",)), "negative on the left"
+    return {
         "roll_radius": whole((), "m", "radius of the rolls"),
-        "roll_axis_x": whole((), "m", "distance of the roll axes from the mid-plane", "at height 0"),
-        "xi": whole(("streamline",), "1", "position of the streamline", "over half the gap, negative on the left"),
-        "x": whole(field, "m", "distance from the mid-plane", across),
+        "roll_axis_x": whole((), "m", "distance of the roll axes from the mid-plane"),
+        "xi": whole(("streamline",), "1", "position of the streamline", f"over half the gap, {left}"),
+        "x": whole(("streamline", "point"), "m", "distance from the mid-plane", left),
         "mid_gap_depth": whole(("point",), "m", "depth on the mid-plane", "below the top of the bed, where v = 0"),
-        "mid_gap_pressure": whole(("point",), "Pa", "mean stress on the mid-plane"),
-        "shown_x": whole(place, "m", "distance of the shown point from the mid-plane", across),
-        "shown_height": whole(place, "m", "height of the shown point", "above the minimum gap"),
-        "volume": whole(place, "m2", "volume per roll width", "area of the shown point's Voronoi cell"),
+        "shown_x": point("m", "distance of the shown point from the mid-plane", left),
+        "shown_height": point("m", "height of the shown point"),
+        "volume": point("m2", "volume per roll width", "area of the shown point's Voronoi cell"),
         "shown_time_step": whole((), "s", "time between neighbouring shown points"),
-        "outline_cell": whole(("outline",), "1", "number of the right half's shown point", "that the outline is of"),
-        "corner_outline": whole(corner, "1", "number of the outline", "that the corner is of"),
-        "corner_x": whole(corner, "m", "distance of the corner from the mid-plane", "of a Voronoi cell, right half"),
-        "corner_height": whole(corner, "m", "height of the corner", "of a Voronoi cell above the minimum gap"),
-        "product_xi": whole(product, "1", "position of the stream tube", "distance from the mid-plane over half gap"),
+        "outline_cell": whole(("outline",), "1", "number of the right half's shown point"),
+        "corner_outline": corner("1", "number of the outline"),
+        "corner_x": corner("m", "distance of the corner from the mid-plane", "of a Voronoi cell, right half"),
+        "corner_height": corner("m", "height of the corner", "of a Voronoi cell"),
+        "product_xi": whole(product, "1", "position of the stream tube", "over half the gap"),
         "passing": Variable((*product, "sieve"), "1", "mass fraction passing", "product of the stream tube"),
-        "p50": Variable(product, "m", "product P50", "size that 50 % of the stream tube's product passes"),
-        "p80": Variable(product, "m", "product P80", "size that 80 % of the stream tube's product passes"),
+        "p50": Variable(product, "m", "product P50"),
+        "p80": Variable(product, "m", "product P80"),
         "feed_passing": whole(("sieve",), "1", "mass fraction of the feed passing"),
-        "snapshot": whole(frame, "1", "snapshot number", "of the start-up"),
-        "elapsed_time": whole(frame, "s", "time since the machine was filled"),
-        "steady": whole(frame, "1", "whether the snapshot is steady", "taken after one residence time"),
-        "startup_p80": whole((*frame, *place), "m", "P80 at the shown point", "while the machine fills"),
-        "assumption": whole(variant, "", "what is changed in the scene"),
+        "snapshot": frame("1", "snapshot number", "of the start-up"),
+        "elapsed_time": frame("s", "time since the machine was filled"),
+        "steady": frame("1", "whether the snapshot is steady"),
+        "startup_p80": whole(("snapshot", *place), "m", "P80 at the shown point"),
+        "assumption": variant("", "what is changed in the scene"),
+        "assumed_peak_pressure_mid_gap": variant("Pa", "peak pressure of the innermost stream tube"),
+        "assumed_peak_pressure_roll": variant("Pa", "peak pressure of the outermost stream tube"),
+        "assumed_p80_mid_gap": variant("m", "product P80 of the innermost stream tube"),
+        "assumed_p80_roll": variant("m", "product P80 of the outermost stream tube"),
     }
-    for where, tube in {"mid_gap": "innermost", "roll": "outermost"}.items():
-        table[f"assumed_peak_pressure_{where}"] = whole(variant, "Pa", f"peak pressure of the {tube} stream tube")
-        table[f"assumed_p80_{where}"] = whole(variant, "m", f"product P80 of the {tube} stream tube")
-    return table
 
 
 def _refuse(scene: Scene, shown_points: int) -> None:
@@ -199,21 +184,15 @@ def _refuse(scene: Scene, shown_points: int) -> None:
 def mirrored(values, odd: bool = False) -> np.ndarray:
     """Return values over (streamline from the mid-plane outwards, ...) for both halves, the left roll first.
 
-    The first streamline is doubled unless it is the mid-plane itself, which the caller then drops; odd ones, such as
-    x, change sign on the left.
+    Odd ones, such as x, change sign on the left.
     """
     values = np.asarray(values)
     return np.concatenate([-values[::-1] if odd else values[::-1], values])
 
 
 def _across(values, odd: bool = False) -> np.ndarray:
-    """Return both halves of values whose first streamline is the mid-plane."""
+    """Return both halves of values whose first streamline is the mid-plane, which is there once."""
     return np.delete(mirrored(values, odd), len(values) - 1, axis=0)
-
-
-def _rolls(scene: Scene) -> dict[str, Any]:
-    rolls = scene.rolls
-    return {"roll_radius": rolls.diameter / 2, "roll_axis_x": (rolls.gap + rolls.diameter) / 2}
 
 
 def _fields(scene: Scene) -> dict[str, Any]:
@@ -236,9 +215,9 @@ def _fields(scene: Scene) -> dict[str, Any]:
         "shear_stress": state.shear_stress,
     }
     values = {name: _across(each[:, ::substeps], odd=name == "x") for name, each in found.items()}
-    middle = len(xi) - 1
-    values |= {"mid_gap_depth": bed.height - values["height"][middle], "mid_gap_pressure": values["pressure"][middle]}
-    return values | {"xi": _across(xi, odd=True)}
+    depth = bed.height - values["height"][len(xi) - 1]
+    rolls = {"roll_radius": scene.rolls.diameter / 2, "roll_axis_x": (scene.rolls.gap + scene.rolls.diameter) / 2}
+    return values | rolls | {"xi": _across(xi, odd=True), "mid_gap_depth": depth}
 
 
 def _shown(shown: Scene) -> dict[str, Any]:
@@ -340,55 +319,45 @@ def _assumptions(scene: Scene, seed: int) -> dict[str, Any]:
 
 def findings(result: "xr.Dataset") -> list[str]:
     """Return lines that put numbers beside what the paper says of its figures in words."""
-    lines = [_pressure_words(result), _across_words(result), _product_words(result)]
+    middle = result.sizes["streamline"] // 2
+    lines = [_pressure_words(result.isel(streamline=middle)), *_across_words(result, middle)]
     if "assumption" in result:
         lines += ["", *_assumption_table(result).splitlines(), ""]
     return lines
 
 
-def crossing_heights(result: "xr.Dataset", fractions: Sequence[float]) -> list[float]:
-    """Return the heights in m at which the mid-gap pressure first exceeds these fractions of its peak."""
-    pressure, height = result["mid_gap_pressure"].values, result["height"].sel(streamline=_middle(result)).values
+def crossing_heights(mid_gap: "xr.Dataset", fractions: Sequence[float]) -> list[float]:
+    """Return the heights in m at which the pressure on a streamline first exceeds these fractions of its peak."""
+    pressure, height = mid_gap["pressure"].values, mid_gap["height"].values
     return [float(height[np.argmax(pressure > fraction * pressure.max())]) for fraction in fractions]
 
 
-def _middle(result) -> int:
-    return result.sizes["streamline"] // 2
-
-
-def _pressure_words(result) -> str:
-    middle = _middle(result)
-    pressure, height = result["mid_gap_pressure"].values, result["height"].values[middle]
+def _pressure_words(mid_gap) -> str:
+    pressure, height = 1e-6 * mid_gap["pressure"].values.astype(float), 1e3 * mid_gap["height"].values
     if not pressure.any():
         return "figure 4: the bed is not compacted, there is no pressure"
-    top = height + result["mid_gap_depth"].values
-    begin, tenth, most = (1e3 * one for one in crossing_heights(result, (0.0, 0.1, 0.9)))
+    begin, tenth, most = (1e3 * one for one in crossing_heights(mid_gap, (0.0, 0.1, 0.9)))
     peak = int(pressure.argmax())
-    highest, last = 1e-6 * pressure[peak], 1e-6 * pressure[-1]
+    top = height[0] + 1e3 * float(mid_gap["mid_gap_depth"][0])
     return (
-        f"figure 4c: mid-gap pressure is zero down to {begin:.0f} mm above the gap (bed {1e3 * top[0]:.0f} mm high), "
-        f"rises from 10 % to 90 % of its peak between {tenth:.0f} and {most:.0f} mm, peaks with {highest:.4g} MPa at "
-        f"{1e3 * height[peak]:.0f} mm, and is {last:.4g} MPa at the gap"
+        f"figure 4c: mid-gap pressure is zero down to {begin:.0f} mm above the gap (bed {top:.0f} mm high), rises from "
+        f"10 % to 90 % of its peak between {tenth:.0f} and {most:.0f} mm, peaks with {pressure[peak]:.4g} MPa at "
+        f"{height[peak]:.0f} mm, and is {pressure[-1]:.4g} MPa at the gap"
     )
 
 
-def _across_words(result) -> str:
-    middle = _middle(result)
+def _across_words(result, middle: int) -> list[str]:
     row = result["pressure"].values[middle:, -1].astype(float)
-    falls = bool((np.diff(row) < 0).all())
-    shown = "falls all the way" if falls else "does not fall all the way"
+    falls = "falls" if (np.diff(row) < 0).all() else "does not fall"
     ratio = f"{100 * (row[-1] / row[0] - 1):+.1f} %" if row[0] > 0 else "no pressure"
-    return f"figure 4a: at the gap, mean stress {shown} from mid-gap to the roll ({ratio})"
-
-
-def _product_words(result) -> str:
     p80 = 1e3 * result["p80"].values.astype(float)
     apart = 100 * (result["passing"].values[0] - result["passing"].values[-1]).astype(float)
-    return (
+    return [
+        f"figure 4a: at the gap, mean stress {falls} all the way from mid-gap to the roll ({ratio})",
         f"figure 5: P80 is {p80[0]:.4g} mm in the innermost stream tube and {p80[-1]:.4g} mm in the outermost "
         f"({100 * (p80[-1] / p80[0] - 1):+.1f} %); at the sieves the innermost passes up to {apart.max():.2f} percent "
-        f"points more, and at most {max(-apart.min(), 0.0):.2f} less"
-    )
+        f"points more, and at most {max(-apart.min(), 0.0):.2f} less",
+    ]
 
 
 def _assumption_table(result) -> str:

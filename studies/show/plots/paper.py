@@ -35,10 +35,9 @@ def figure3(result: xr.Dataset) -> Figure:
     speed = _field(panels[1], result, result["speed"], maps.davos_r, "{:g}")
     figure.colorbar(speed, ax=panels[1], label="speed [m/s]", shrink=0.85)
     panels[1].set_title("(b) Speed")
-    panels[2].plot(
-        1e3 * result["shown_x"].values.T, 1e3 * result["shown_height"].values.T, "-", color="0.75", linewidth=0.5
-    )
-    panels[2].plot(1e3 * result["shown_x"].values, 1e3 * result["shown_height"].values, ".k", markersize=1.6)
+    x, height = (1e3 * result[name].values for name in ("shown_x", "shown_height"))
+    panels[2].plot(x.T, height.T, "-", color="0.75", linewidth=0.5)
+    panels[2].plot(x, height, ".k", markersize=1.6)
     step = 1e3 * float(result["shown_time_step"])
     panels[2].set_title(f"(c) Material points, Δt = {step:.3g} ms apart")
     outlines, volumes = _outlines(result, 1e6 * result["volume"].values)
@@ -175,45 +174,23 @@ def _startup_words(result: xr.Dataset) -> str:
     )
 
 
-def _draw_cells(
-    panel, outlines: list[np.ndarray], values: np.ndarray, norm: Normalize, cmap=maps.batlow
-) -> list[PolyCollection]:
+def _draw_cells(panel, outlines: list[np.ndarray], values: np.ndarray, norm: Normalize) -> list[PolyCollection]:
     """Draw cells of the right half (outlines in m), coloured by `values`, and their mirror images; return both."""
-    drawn = []
-    for side in (1, -1):
-        part = PolyCollection(
-            [1e3 * outline * (side, 1) for outline in outlines],
-            array=values,
-            cmap=cmap,
-            norm=norm,
-            edgecolors="0.2",
-            linewidths=0.25,
-        )
+    style = {"array": values, "cmap": maps.batlow, "norm": norm, "edgecolors": "0.2", "linewidths": 0.25}
+    drawn = [PolyCollection([1e3 * outline * (side, 1) for outline in outlines], **style) for side in (1, -1)]
+    for part in drawn:
         panel.add_collection(part)
-        drawn.append(part)
     return drawn
 
 
-def _draw_rolls(panel, radius: float, axis: float, half_width: float, height: float) -> None:
-    """Draw both rolls (lengths in m) behind a bed of this size, and set the panel's limits, aspect and labels in mm.
-
-    `axis` is the distance of the roll axes from the mid-plane, `half_width` that of the bed at its top.
-    """
-    for side in (-1, 1):
-        panel.add_patch(Circle((side * 1e3 * axis, 0), 1e3 * radius, facecolor="0.85", edgecolor="0.3", zorder=0))
-    panel.set(
-        xlabel="x across the gap [mm]",
-        ylabel="height above the minimum gap [mm]",
-        xlim=(-1.25e3 * half_width, 1.25e3 * half_width),
-        ylim=(-0.06e3 * height, 1.04e3 * height),
-        aspect="equal",
-    )
-
-
 def _rolls(panel, result: xr.Dataset) -> None:
-    height = float((result["height"] + result["mid_gap_depth"]).max())
-    half_width = float(result["x"].max())
-    _draw_rolls(panel, float(result["roll_radius"]), float(result["roll_axis_x"]), half_width, height)
+    """Draw both rolls behind the bed, and set the panel's limits, aspect and labels in mm."""
+    height, half_width = 1e3 * float((result["height"] + result["mid_gap_depth"]).max()), 1e3 * float(result["x"].max())
+    radius, axis = 1e3 * float(result["roll_radius"]), 1e3 * float(result["roll_axis_x"])
+    for side in (-1, 1):
+        panel.add_patch(Circle((side * axis, 0), radius, facecolor="0.85", edgecolor="0.3", zorder=0))
+    panel.set(xlabel="x across the gap [mm]", ylabel="height above the minimum gap [mm]", aspect="equal")
+    panel.set(xlim=(-1.25 * half_width, 1.25 * half_width), ylim=(-0.06 * height, 1.04 * height))
 
 
 def _streamlines(panel, result: xr.Dataset) -> None:
@@ -261,17 +238,14 @@ def _compacting(panel, result: xr.Dataset) -> None:
 
 
 def _along_mid_gap(panel, result: xr.Dataset) -> None:
-    middle = result.sizes["streamline"] // 2
-    depth = 1e3 * result["mid_gap_depth"].values
-    top = float(1e3 * (result["mid_gap_depth"] + result["height"][middle])[0])
-    panel.plot(1e-6 * result["mid_gap_pressure"].values, depth, "k-", linewidth=1.8, label="p at mid-gap")
-    rim_depth = top - 1e3 * result["height"].values[-1]
-    panel.plot(
-        1e-6 * result["pressure"].values[-1], rim_depth, "--", color="0.35", linewidth=1.4, label="p at the roll"
-    )
-    panel.plot(
-        1e-6 * result["shear_stress"].values[middle], depth, ":", color="0.35", linewidth=1.6, label="q at mid-gap"
-    )
+    middle, height = result.sizes["streamline"] // 2, 1e3 * result["height"].values
+    top = 1e3 * float(result["mid_gap_depth"][0]) + height[middle, 0]
+    for name, line, style, label in (
+        ("pressure", middle, {"color": "k", "linewidth": 1.8}, "p at mid-gap"),
+        ("pressure", -1, {"color": "0.35", "linewidth": 1.4, "linestyle": "--"}, "p at the roll"),
+        ("shear_stress", middle, {"color": "0.35", "linewidth": 1.6, "linestyle": ":"}, "q at mid-gap"),
+    ):
+        panel.plot(1e-6 * result[name].values[line], top - height[line], label=label, **style)
     panel.set(ylim=(top, 0), xlabel="stress [MPa]", ylabel="depth below the top of the bed [mm]")
     panel.set_xlim(left=0)
     panel.set_title("(c) Mean stress along the mid-gap")
@@ -282,13 +256,12 @@ def _along_mid_gap(panel, result: xr.Dataset) -> None:
 def _across_gap(panel, result: xr.Dataset) -> None:
     x = 1e3 * result["x"].values[:, -1]
     for name, label, dash, lightness in (("pressure", "p", "-", "0"), ("shear_stress", "q", ":", "0.35")):
-        panel.plot(
-            x, 1e-6 * result[name].values[:, -1], linestyle=dash, color=lightness, marker="o", markersize=3, label=label
-        )
+        style = {"linestyle": dash, "color": lightness, "marker": "o", "markersize": 3}
+        panel.plot(x, 1e-6 * result[name].values[:, -1], label=label, **style)
     for roll in (x[0], x[-1]):
         panel.axvline(roll, color="0.3", linewidth=3)
     panel.set(xlim=(x[0], x[-1]), xlabel="x across the gap [mm]", ylabel="stress [MPa]")
-    panel.set_ylim(0, 1.3e-6 * max(float(result["shear_stress"].max()), float(result["pressure"].max())) or 1.0)
+    panel.set_ylim(0, 1.3e-6 * float(max(result[name].max() for name in ("shear_stress", "pressure"))) or 1.0)
     panel.set_title("(d) Stresses across the minimum gap (ours)")
     panel.legend(loc="lower center", ncols=2)
     panel.grid(color="0.9")
