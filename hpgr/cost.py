@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import psutil
 
+from hpgr.grains.solve import choose
 from hpgr.scene import Scene
 
 _SHARE = 0.8  # of the available memory that one scene may take; the rest is for the reader of the result
@@ -26,33 +27,37 @@ class Cost(NamedTuple):
 
 
 def predict(scene: Scene) -> Cost:
-    """Return the predicted cost of `scene`: memory beyond the interpreter's, and time on one core.
+    """Return the predicted cost of `scene`: peak memory beyond the interpreter's, and processor time.
 
-    The coefficients are measured on the paper's scene (docs/performance.md); treat times as good to a
-    factor of 2.
+    Coefficients are measured (docs/performance.md): a run takes at most 1.3 times these bytes, and times are good to a
+    factor of 5.
     """
-    grid = scene.resolution
+    grid, exchange, solver = scene.resolution, scene.exchange, choose(scene)
     lines, points, cells = grid.streamlines, grid.points, grid.cells
+    slices = 1 if scene.roll_width is None else 2 * scene.roll_width.slices
+    columns, frames = lines * slices, grid.snapshots
     fields = lines * ((points - 1) * scene.elasticity.substeps + 1)
-    size = 240 * fields  # the arrays of motion and load, 8 bytes each, with their temporaries
-    seconds = 2.5e-3 + 1.5e-6 * fields
-    if cells:
-        columns = lines * (1 if scene.roll_width is None else 2 * scene.roll_width.slices)
-        product = 4 * grid.snapshots * columns * cells
-        at_once = max(os.cpu_count() or 1, 200_000 // cells)  # parcels, see hpgr.grains.solve
-        size += 3 * product + 40 * cells * min(columns * grid.snapshots, at_once)  # kept, pooled, sorted; work space
-        seconds += grid.snapshots * columns * cells * (0.28e-6 + 0.15e-9 * points)
-        frames = grid.snapshots
-        if scene.exchange is not None:
-            frames += -(-(points - 1) // scene.exchange.interval) if scene.exchange.record_startup else 0
-            size += 17 * lines * points * cells + 30_000 * lines * points  # parcels; edges of the tessellation
-            steps = points + grid.snapshots * scene.exchange.interval
-            seconds += 5e-5 * lines * points + steps * lines * points * (2e-6 + 1.5e-9 * cells)
-        if grid.record == "cells":
-            size += 4 * frames * lines * points * cells
-            seconds += 1e-9 * frames * lines * points * cells
-        elif grid.record == "distributions":
-            size += 16 * frames * lines * points * (len(grid.sieves) + 1)
+    size, seconds = 150 * fields, 1.5e-3 + 0.25e-6 * fields  # motion and stress, with temporaries
+    if solver == "closed form":
+        size += 5_000 * columns  # nodes of quadratures, places of a search
+        seconds += 40e-6 * columns + 2e-8 * slices * columns * len(grid.sieves)
+    elif cells:
+        product = grid.snapshots * columns * cells
+        at_once = max(os.cpu_count() or 1, 200_000 // cells)  # parcels, see hpgr.grains.march
+        size += (12 if slices == 1 else 60) * product  # kept, pooled, sorted; with slices ordered by their shares
+        size += 40 * cells * min(columns * grid.snapshots, at_once)  # work space
+        seconds += product * (0.2e-6 + 0.15e-9 * points)
+    if solver == "lattice":
+        steps = points + grid.snapshots * exchange.interval
+        frames += -(-(points - 1) // exchange.interval) if exchange.record_startup else 0
+        size += 24 * lines * points * cells + 10_000 * lines * points  # parcels; edges of the tessellation
+        seconds += 5e-5 * lines * points + steps * lines * points * (2e-6 + 3e-9 * cells)
+    if cells and grid.record == "cells":
+        size += 4 * frames * lines * points * cells
+        seconds += 1e-9 * frames * lines * points * cells
+    elif cells and grid.record == "distributions":
+        size += (84 if solver == "closed form" else 16) * frames * lines * points * (len(grid.sieves) + 1)
+        seconds += 1e-7 * frames * lines * points * len(grid.sieves)
     return Cost(size, seconds)
 
 

@@ -142,22 +142,37 @@ def test_refusal_names_the_group_that_it_was_held_against(groups):
         cost.refuse_too_large(paper())
 
 
-def test_prediction_covers_what_a_process_takes():
-    """Peak memory of a process that runs a scene, above that of one that runs the same scene with few cells."""
+TAKEN = {
+    "march": {"resolution.cells": sized(60_000, 2000), "resolution.points": 101},
+    "product": {"resolution.cells": sized(200_000, 2000), "resolution.record": "product"},
+    "width": {"roll_width": {}, "resolution.cells": sized(20_000, 500), "resolution.record": "product"},
+    "distributions": {
+        "resolution.points": 20_000,
+        "strength.cushioning": float("inf"),
+        "resolution.record": "distributions",
+    },
+    "lattice": {"exchange.record_startup": True, "resolution.cells": 3000, "resolution.points": 101},
+    "stress": {"resolution.points": 200_000, "resolution.cells": 0},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TAKEN)
+def test_prediction_covers_what_a_process_takes(name):
+    """Peak memory of a process that runs a scene, above what it had after running it small."""
     script = (
-        "import resource, sys; from support import paper; from hpgr import cost, simulate\n"
-        "scene = paper({'resolution.cells': int(sys.argv[1]), 'resolution.points': 101})\n"
+        "import resource, sys; from support import paper; from test_cost import TAKEN\n"
+        "from hpgr import cost, simulate\n"
+        "values = TAKEN[sys.argv[1]]\n"
+        "small = values | {'resolution.points': 21, 'resolution.cells': min(values.get('resolution.cells', 64), 4)}\n"
+        "simulate(paper(small))\n"
+        "before, scene = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, paper(values)\n"
         "simulate(scene)\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, cost.predict(scene).bytes)\n"
+        "print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024, cost.predict(scene).bytes)\n"
     )
+    command = [sys.executable, "-W", "ignore", "-c", script, name]
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-
-    def peak(cells):
-        done = subprocess.run(
-            [sys.executable, "-W", "ignore", "-c", script, str(cells)], capture_output=True, text=True, check=True,
-            env=os.environ | {"PYTHONPATH": path},
-        )  # fmt: skip
-        return map(int, done.stdout.split())
-
-    (few, _), (many, predicted) = peak(10), peak(sized(60_000, 2000))
-    assert many - few < 1.2 * predicted + 20e6  # an interpreter's own memory varies by some MB
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ | {"PYTHONPATH": path})
+    taken, predicted = map(int, done.stdout.split())
+    assert taken < 1.3 * predicted + 10e6  # an interpreter's own memory varies by some MB
+    assert predicted < 3 * taken + 30e6

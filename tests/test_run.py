@@ -363,7 +363,7 @@ def test_no_size_effect_and_no_cushion_break_everything_in_step(gamma):
     ds = simulate(paper(values | {"feed": {"kind": "single", "size": 0.06}}))
     compacting = (ds["volumetric_strain_rate"] > 0) & (ds["pressure"] > 1)
     steps = int(compacting.sum())
-    assert steps == 3
+    assert steps == 4
     assert float(ds["breaks_per_cell"][0]) == steps
     drop = -np.log(product_sizes(ds)[0, 0].astype(float) / 0.06)
     assert ks_distance(drop, stats.gamma(steps, scale=1 / gamma).cdf) < KS / math.sqrt(cells)
@@ -534,7 +534,7 @@ def test_no_field_of_a_scene_is_forgotten():
             assert (Addresses(SweepSpec(changed)).of({}, 0) != address) is (name != "remark"), name
             found = run_scene(changed)
             section, _, key = name.partition(".")
-            bed = section in {"flow", "elasticity"} or key in OF_THE_BED | {"points"}
+            bed = section in {"flow", "elasticity", "roll_width"} or key in OF_THE_BED | {"points", "width"}
             if base.rolls.specific_pressing_force is None:  # else the gap floats with what is not of the bed, too
                 same = loaded.inputs_of(changed, True) == loaded.inputs_of(base, True)
                 assert same is not bed, name
