@@ -17,20 +17,7 @@ import numpy as np
 import tyro
 
 from hpgr.scene import Scene, levels
-from studies.command import (
-    Out,
-    Overwrite,
-    Plot,
-    Quick,
-    Report,
-    SceneName,
-    Seed,
-    base_scene,
-    command,
-    figure,
-    progress_bar,
-    shown_as,
-)
+from studies import command as cli
 from studies.convergence import ROUNDING, jackknife, pareto, richardson
 
 if TYPE_CHECKING:
@@ -68,19 +55,8 @@ class Plan(NamedTuple):
 
 
 FULL = Plan()
-QUICK = Plan(
-    (2, 51, 100),
-    (26, 51, 101),
-    400,
-    (1, 2, 4),
-    100,
-    (25, 50, 100, 200),
-    (1, 2, 4),
-    50,
-    ((2, 4), (26, 51, 101), (50, 200)),
-    ("draft",),
-    (4, 500),
-    8,
+QUICK = Plan((2, 51, 100), (26, 51, 101), 400, (1, 2, 4), 100, (25, 50, 100, 200), (1, 2, 4), 50)._replace(
+    grid=((2, 4), (26, 51, 101), (50, 200)), levels=("draft",), reference=(4, 500), replicates=8
 )
 
 
@@ -101,30 +77,30 @@ class Ladder(NamedTuple):
 class Options:
     """Options of the study; the scene's own streamlines, points and cells do not matter, the ladders are fixed."""
 
-    scene: SceneName = "paper"
-    replicates: Annotated[int | None, shown_as("N")] = None
+    scene: cli.SceneName = "paper"
+    replicates: Annotated[int | None, cli.shown_as("N")] = None
     """Independent repetitions of every run, at least 2 (default: 32, with --quick 8)."""
-    seed: Seed = 0
-    quick: Quick = False
+    seed: cli.Seed = 0
+    quick: cli.Quick = False
     markdown: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print every table, as markdown, instead of the short ones."""
-    out: Out = Path("outputs/accuracy.nc")
-    plot: Plot = True
-    overwrite: Overwrite = False
+    out: cli.Out = Path("outputs/accuracy.nc")
+    plot: cli.Plot = True
+    overwrite: cli.Overwrite = False
 
 
-@command("accuracy", __doc__)
-def main(options: Options) -> Report:
+@cli.command("accuracy", __doc__)
+def main(options: Options) -> cli.Report:
     """Run the study of the command line."""
     plan = QUICK if options.quick else FULL
     if options.replicates is not None:
         plan = plan._replace(replicates=options.replicates)
-    result = study(base_scene(options.scene), plan, options.seed, progress=True)
+    result = study(cli.base_scene(options.scene), plan, options.seed, progress=True)
     from studies.show import accuracy_tables as tables
     from studies.show.plots.accuracy import accuracy_figure
 
     text = tables.in_words(result, options.markdown)
-    return Report(text.splitlines(), [result, figure(lambda: accuracy_figure(result), dpi=150)])
+    return cli.Report(text.splitlines(), [result, cli.figure(lambda: accuracy_figure(result), dpi=150)])
 
 
 def study(scene: Scene, plan: Plan, seed: int = 0, progress: bool = False) -> "xr.Dataset":
@@ -141,7 +117,7 @@ def study(scene: Scene, plan: Plan, seed: int = 0, progress: bool = False) -> "x
     _refuse(scene, plan)
     scene = scene.with_values({"resolution.record": "product", "resolution.sieves": [_SIEVE]})
     ladders, found = _ladders(scene, plan), {}
-    with progress_bar(sum(len(one.scenes) * one.replicates for one in ladders.values()), progress, "runs") as bar:
+    with cli.progress_bar(sum(len(one.scenes) * one.replicates for one in ladders.values()), progress, "runs") as bar:
         for name, ladder in ladders.items():
             values, seconds = _climb(ladder, seed, bar)
             if name == "reference":  # the first, for the bias of every combination

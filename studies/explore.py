@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from studies.command import Overwrite, Report, Sieve, command, quantity_of, shown_as
+from studies import command as cli
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 class Options:
     """Options of the explorer; the page has a slider for the sieve."""
 
-    result: Annotated[Path, tyro.conf.Positional, shown_as("FILE")]
+    result: Annotated[Path, tyro.conf.Positional, cli.shown_as("FILE")]
     """NetCDF file of a sweep, such as outputs/gap_sweep.nc."""
-    sieve: Sieve = "1 mm"
-    out: Annotated[Path | None, shown_as("FILE")] = None
+    sieve: cli.Sieve = "1 mm"
+    out: Annotated[Path | None, cli.shown_as("FILE")] = None
     """Page to write (default: beside the NetCDF file, as .html)."""
-    overwrite: Overwrite = False
+    overwrite: cli.Overwrite = False
 
 
 def _files(options: Options) -> list[Path]:
@@ -34,10 +34,10 @@ def _files(options: Options) -> list[Path]:
     return [out]
 
 
-@command("explore", __doc__, files=_files)
-def main(options: Options) -> Report:
+@cli.command("explore", __doc__, files=_files)
+def main(options: Options) -> cli.Report:
     """Write the page of the command line."""
-    sieve = quantity_of("--sieve", options.sieve, "m")
+    sieve = cli.quantity_of("--sieve", options.sieve, "m")
     library = chart_library()
     from studies.show.page import page_data, page_of
 
@@ -46,7 +46,7 @@ def main(options: Options) -> Report:
     def write(path: Path, history: str) -> None:
         path.write_text(page_of(data, library, history), encoding="utf-8")
 
-    return Report(parts=[write])
+    return cli.Report(parts=[write])
 
 
 def chart_library() -> str:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 from pydantic import ValidationError
 
 from hpgr import cost
-from studies.command import Out, Overwrite, Plot, Quick, Report, Seed, beside, command, figure, progress_bar, shown_as
+from studies import command as cli
 from studies.guard import maps, ranges
 from studies.guard.judge import KINDS, Outcome, as_wanted, base, catalogue, hosts, judge
 
@@ -40,22 +40,22 @@ class Walked(NamedTuple):
 class Options:
     """Options of the study."""
 
-    scenes: Annotated[int, shown_as("N")] = 2000
+    scenes: Annotated[int, cli.shown_as("N")] = 2000
     """Random scenes; every fourth has exchange."""
-    seed: Seed = 0
-    quick: Quick = False
-    out: Out = Path("outputs/extremes.nc")
-    plot: Plot = True
-    overwrite: Overwrite = False
+    seed: cli.Seed = 0
+    quick: cli.Quick = False
+    out: cli.Out = Path("outputs/extremes.nc")
+    plot: cli.Plot = True
+    overwrite: cli.Overwrite = False
 
 
 def _files(options: Options) -> list[Path]:
-    out, *picture = beside(options)
+    out, *picture = cli.beside(options)
     return [out, *picture, *(one.with_stem(f"{one.stem}_euler") for one in picture)]
 
 
-@command("extremes", __doc__, files=_files)
-def main(options: Options) -> Report:
+@cli.command("extremes", __doc__, files=_files)
+def main(options: Options) -> cli.Report:
     """Run the study of the command line; with --quick 100 random scenes at most, every tenth pair and coarse maps."""
     if not 0 <= options.scenes <= 1_000_000:
         raise ValueError(f"--scenes: got {options.scenes}; must be within 0 to 1,000,000; such as --scenes 2000")
@@ -66,9 +66,9 @@ def main(options: Options) -> Report:
     told += [f"FAULT in {silent} scenes of the maps"] if silent else []
     from studies.show.plots import extremes as plots
 
-    pictures = [figure(lambda draw=draw: draw(result), dpi=75) for draw in (plots.stability, plots.integrators)]
+    pictures = [cli.figure(lambda draw=draw: draw(result), dpi=75) for draw in (plots.stability, plots.integrators)]
     lines = [*table(result).splitlines(), f"silent faults: {silent + len(faulty(walked))}"]
-    return Report(lines, [result, *pictures], told)
+    return cli.Report(lines, [result, *pictures], told)
 
 
 def walk(scenes: int, seed: int = 0, every: int = 1, progress: bool = False) -> Iterator[Walked]:
@@ -82,7 +82,7 @@ def walk(scenes: int, seed: int = 0, every: int = 1, progress: bool = False) -> 
         ("outside", f"{name} = {_text(end, 17)}", values) for name, end in outside for values in hosts({name: end})[:1]
     ]
     listed += [("pairs", name, values) for name, values in list(_pairs(known))[::every]]
-    with progress_bar(len(rows) + len(listed) + scenes, progress, "scenes") as bar:
+    with cli.progress_bar(len(rows) + len(listed) + scenes, progress, "scenes") as bar:
         for row in rows:
             yield Walked("catalogue", row.name, row.values, as_wanted(row, judge(row.values, seed)))
             bar.update()

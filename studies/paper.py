@@ -13,21 +13,7 @@ import numpy as np
 
 from hpgr.fields import values_of
 from hpgr.scene import Scene
-from studies.command import (
-    Cells,
-    Exchange,
-    Level,
-    Overwrite,
-    Points,
-    Report,
-    SceneName,
-    Seed,
-    Streamlines,
-    base_scene,
-    command,
-    figure,
-    shown_as,
-)
+from studies import command as cli
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -45,42 +31,42 @@ _SIEVES = tuple(float(f"{10 ** (k / 20 - 6):.6g}") for k in range(121))  # 1 um 
 class Options:
     """Options of the figures; without level, cells, points and streamlines level fine, with exchange standard."""
 
-    scene: SceneName = "paper"
-    level: Level = None
-    cells: Cells = None
-    points: Points = None
-    streamlines: Streamlines = None
-    shown_points: Annotated[int, shown_as("N")] = 80
+    scene: cli.SceneName = "paper"
+    level: cli.Level = None
+    cells: cli.Cells = None
+    points: cli.Points = None
+    streamlines: cli.Streamlines = None
+    shown_points: Annotated[int, cli.shown_as("N")] = 80
     """Material points per streamline in figures 3c and 3d and in the animation: few enough to be seen."""
-    exchange: Exchange = False
+    exchange: cli.Exchange = False
     assumptions: bool = True
     """Run the scene with other assumptions too, and say what they change, or not."""
     animation: bool = True
     """Draw the animation of the start-up, or not."""
-    seed: Seed = 0
-    out: Annotated[Path, shown_as("FOLDER")] = Path("outputs")
+    seed: cli.Seed = 0
+    out: Annotated[Path, cli.shown_as("FOLDER")] = Path("outputs")
     """Folder for paper.nc, paper_figure3.png, paper_figure4.png, paper_figure5.png and paper_startup.gif."""
-    overwrite: Overwrite = False
+    overwrite: cli.Overwrite = False
 
 
 def _files(options: Options) -> list[Path]:
     return [options.out / name for name in ("paper.nc", *FIGURES, *([ANIMATION] if options.animation else []))]
 
 
-@command("paper", __doc__, files=_files)
-def main(options: Options) -> Report:
+@cli.command("paper", __doc__, files=_files)
+def main(options: Options) -> cli.Report:
     """Draw the figures of the command line."""
-    scene = base_scene(options)
+    scene = cli.base_scene(options)
     if all(value is None for value in (options.level, options.cells, options.points, options.streamlines)):
         scene = scene.with_values({"resolution": "fine" if scene.exchange is None else "standard"})
     result = study(scene, options.shown_points, options.seed, options.animation, options.assumptions)
     from studies.show.plots import paper as plots
 
     figures = [
-        figure(lambda draw=draw: draw(result), dpi=110) for draw in (plots.figure3, plots.figure4, plots.figure5)
+        cli.figure(lambda draw=draw: draw(result), dpi=110) for draw in (plots.figure3, plots.figure4, plots.figure5)
     ]
     animation = lambda path, history: plots.startup_animation(result, path, history)  # noqa: E731
-    return Report(findings(result), [result, *figures, animation])
+    return cli.Report(findings(result), [result, *figures, animation])
 
 
 def study(
