@@ -208,7 +208,7 @@ def _product(scene: Scene, crushed: solve.Crushed | None) -> dict[str, Any]:
 
 def _along_width(scene: Scene, found: solve.AlongWidth) -> dict[str, Any]:
     return {
-        "width_position": scene.roll_width.cut().position,
+        "width_position": scene.roll_width.cut(scene.rolls.gap, scene.rolls.width).position,
         "passing_slice": found.passing,
         "passing_width_centre": found.centre_passing,
         "passing_width_edge": found.edge_passing,

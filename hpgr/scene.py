@@ -435,12 +435,13 @@ def _nip_faults(known: dict[str, Any]) -> Iterator[Fault]:
         return
     angle = known.get("flow.nip_angle")
     if cake is not None and feed is not None:
-        densest = feed * densest_ratio(gap, diameter)
+        slip = known.get("flow.slip", 0.0)
+        densest = feed * densest_ratio(gap, diameter, slip)
         if cake > densest:
             bound = f"must be at most {densest:.3g}, beyond which no nip angle feeds the cake"
             yield Fault("flow.cake_solid_fraction", f"{cake:g}", bound, "give a lighter cake or a narrower gap")
             return
-        angle = cake_nip_angle(gap, diameter, cake / feed)
+        angle = cake_nip_angle(gap, diameter, cake / feed, slip)
     if angle is not None and known.get("rolls.specific_pressing_force") is None and gap < entry_gap:
         nip = gap + diameter * (1 - math.cos(angle))
         if nip > entry_gap:

@@ -6,7 +6,7 @@ from pydantic import ValidationError
 from support import SIGMAS, sized
 
 from hpgr import presets, simulate
-from hpgr.laws.roll_width import WHOLE, Parabola
+from hpgr.laws.roll_width import WHOLE, FrictionHill, Parabola
 
 INF = math.inf
 PRODUCT = {"resolution.record": "product", "resolution.points": 61, "resolution.streamlines": 3}
@@ -20,7 +20,7 @@ def pilot(values=None, **fields):
 
 def test_slices_share_the_width():
     for slices, edge_share in ((1, 0.05), (4, 0.2), (7, 0.9)):
-        found = Parabola(slices=slices, edge_share=edge_share).cut()
+        found = Parabola(slices=slices, edge_share=edge_share).cut(0.02, 1.0)
         assert found.share.sum() == pytest.approx(1, rel=1e-14)
         assert found.share[found.at_edge].sum() == pytest.approx(edge_share, rel=1e-14)
         assert np.count_nonzero(found.at_edge) == np.count_nonzero(~found.at_edge) == slices
@@ -34,12 +34,37 @@ def test_pressure_is_the_parabola_and_its_mean():
     means = []
     for slices in (4, 8, 16):
         law = Parabola(pressure_drop=0.8, slices=slices)
-        found = law.cut()
+        found = law.cut(0.02, 1.0)
         assert found.pressure == pytest.approx(1 - 0.8 * found.position**2, rel=1e-14)
-        means.append(abs(found.share @ found.pressure - law.mean_pressure()))
-    assert law.mean_pressure() == pytest.approx(1 - 0.8 / 3, rel=1e-14)
+        means.append(abs(found.share @ found.pressure - law.mean_pressure(0.02, 1.0)))
+    assert law.mean_pressure(0.02, 1.0) == pytest.approx(1 - 0.8 / 3, rel=1e-14)
     assert means[0] < 0.01
     assert np.array(means[:-1]) / means[1:] == pytest.approx(4, rel=1e-6)  # midpoint rule of a parabola
+
+
+LAWS = [
+    Parabola(pressure_drop=0.8),
+    FrictionHill(edge_ratio=0.1),
+    FrictionHill(edge_ratio=0.8),
+    FrictionHill(edge_ratio=1e-3, friction=0.02),
+]
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("power", [1.0, 1.5, 2.0])
+def test_mean_pressure_is_the_mean_over_the_width(law, power):
+    """Also where the hill is still rising in the middle of the rolls."""
+    position, thickness = (np.arange(100_000) + 0.5) / 100_000, 0.02
+    exact = (law.pressure(position, thickness, 0.5) ** power).mean()
+    assert law.mean_pressure(thickness, 0.5, power) == pytest.approx(exact, rel=1e-7)
+    relative = law.mean_pressure(np.array([thickness, 2 * thickness]), 0.5, power)
+    assert np.all(np.asarray(relative) <= law.mean_pressure(thickness, 0.5, power))
+
+
+def test_an_edge_as_pressed_as_the_middle_is_no_hill():
+    law = FrictionHill(edge_ratio=1.0)
+    assert law.mean_pressure(0.02, 0.5, 1.5) == 1
+    assert np.all(law.pressure(np.linspace(0, 1, 11), 0.02, 0.5) == 1)
 
 
 @pytest.mark.parametrize("cushioning", [1.0, INF])

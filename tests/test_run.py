@@ -489,6 +489,7 @@ BASES = {
     "nip": SMALL | {"flow": {"kind": "nip", "nip_angle": "12 deg"}, "rolls.specific_pressing_force": "0.2 N/mm^2"},
     "cake": SMALL | {"flow": {"kind": "nip", "cake_solid_fraction": 0.8}},
     "width": SMALL | {"roll_width": {"slices": 2}, "resolution.record": "product"},
+    "hill": SMALL | {"roll_width": {"kind": "friction_hill", "slices": 2}, "resolution.record": "product"},
     "single": SMALL | {"feed": {"kind": "single", "size": "40 mm"}},
     "power": SMALL | {"feed": {"kind": "power_law", "top_size": "60 mm", "exponent": 0.7}},
     "weibull": SMALL | {"feed": {"kind": "rosin_rammler", "size": "30 mm", "exponent": 1.2, "top_size": "60 mm"}},
@@ -496,6 +497,7 @@ BASES = {
 }
 OTHER = {
     "elasticity.integrator": "euler",
+    "elasticity.recovery_modulus": 1e9,
     "strength.stress": "major",
     "exchange.start": "crushed",
     "exchange.record_startup": False,
@@ -513,7 +515,7 @@ def other_value(name, value):
         return "cells" if value == "distributions" else None
     if name in OTHER or isinstance(value, str | None):
         return OTHER.get(name)
-    return value + 1 if isinstance(value, int) else 3.0 if math.isinf(value) else 0.95 * value or 5.0
+    return value + 1 if isinstance(value, int) else 3.0 if math.isinf(value) else 0.95 * value or 0.5
 
 
 def test_no_field_of_a_scene_is_forgotten():

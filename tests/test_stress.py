@@ -20,7 +20,9 @@ exponents = pytest.mark.parametrize("c", [0.3, 0.5, 1.0, 2.0])
 def loaded_path(scene, steps, volumetric_rate, time_step):
     """March one streamline through the strains of `steps`; positions do not matter to the stress."""
     still = np.zeros((1, len(volumetric_rate)))
-    motion = Kinematics(still, still, still[0], still, np.asarray(volumetric_rate, float)[None], still, time_step)
+    motion = Kinematics(
+        still, still, still[0], still, np.asarray(volumetric_rate, float)[None], still, still, time_step
+    )
     _, *elastic = inputs_of(scene).laws()
     return stress.load(*elastic, motion, StepStrains(*(np.append(0.0, step)[None] for step in steps)))
 
@@ -314,3 +316,32 @@ def test_bed_of_the_pilot_rolls_stays_off_the_shear_limit():
     assert np.all(ratio >= 2 / 3)
     assert ratio[0] == pytest.approx(2 / 3, abs=0.02)
     assert ratio.max() < PILOT.elasticity.largest_shear_ratio()
+
+
+# --- real machines ------------------------------------------------------------------------------------------
+
+
+def test_stiffness_grows_as_pores_close_and_is_the_papers_without_densification():
+    law, plain = (GranularElasticity(densification=k) for k in (3.0, 0.0))
+    phi = np.array([0.6, 0.75, 0.9])
+    assert plain.stiffness(phi, 0.6, 1.0) == pytest.approx(phi**3, rel=1e-15)
+    assert law.stiffness(phi, 0.6, 1.0) == pytest.approx(phi**3 * (0.4 / (1 - phi)) ** 3, rel=1e-14)
+
+
+@pytest.mark.parametrize("integrator", ["increment", "euler"])
+def test_march_of_a_bed_that_densifies_adds_up_the_laws_stiffness(integrator):
+    dense = {"elasticity.densification": 3.0, "bed.max_solid_fraction": 1.0, "elasticity.integrator": integrator}
+    scene, eps_v = paper(dense), np.linspace(0.0, 0.3, 20_001)
+    law, eps_s = scene.elasticity, eps_v / 2
+    state = follow(scene, eps_v, eps_s)
+    stiffness = law.stiffness(0.6 * np.exp(eps_v), 0.6, 1.0)
+    exact = np.trapezoid(stiffness, law.pressure(eps_v, eps_s)), np.trapezoid(stiffness, law.shear_stress(eps_v, eps_s))
+    assert (state.pressure[0, -1], state.shear_stress[0, -1]) == pytest.approx(exact, rel=1e-3)
+
+
+def test_a_bed_as_dense_as_can_be_is_stiff_and_not_infinitely():
+    """The paper's machine asks for a solid fraction of 1.7."""
+    state = loaded(paper({"elasticity.densification": 5.0}), 401)
+    assert np.all(np.isfinite(state.pressure))
+    assert state.continuity_solid_fraction.max() > 1.6
+    assert state.pressure.max() > 100 * loaded(paper(), 401).pressure.max()

@@ -1,4 +1,4 @@
-"""The bed, compiled, and the only one there is: points, strains, stresses, wall force and power of every streamline.
+"""The bed, compiled, and the only one there is: points, strains and stresses of every streamline.
 
 Streamlines do not know of each other. Arrays are (streamline, point), or (point,) of one line, entry to exit; `bed` is
 a `hpgr.bed.geometry.Geometry`, `flow` and `elastic` are the constants of a law. A law has one branch, on its tag: a
@@ -13,55 +13,76 @@ from numba import njit
 
 from hpgr.laws.flow import NIP, POWER
 
-_compiled = njit(cache=True, nogil=True, error_model="numpy")
+_HOW = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_compiled = njit(**_HOW)
+_inner = njit(**_HOW, no_cpython_wrapper=True)  # not to be called from Python: a fifth of the compile time saved
 
 _PANELS = 64  # 5-point Gauss on 64 panels: travel times to 1e-13 for every entry_fraction down to 1e-9
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
+_DENSEST = 0.9999  # of the largest solid fraction, where a bed that stiffens as pores close is held
 _TENSION_NOISE = 1e-9  # of the largest stress; less is rounding of the running sum
 
 
 class Line(NamedTuple):
-    """The streamline x = xi X(y) of a bed, and the height of the nip, of the bed where there is none."""
+    """The streamline x = xi X(y) of a bed; what holds above a nip and below it follows from the last three.
+
+    Attributes
+    ----------
+    half_gap, height, b, c : float
+        The bed, see `hpgr.bed.geometry.Geometry`.
+    xi : float
+        Its label.
+    nip : float
+        Height of the nip, m.
+    flux, flux_by_xi : float
+        X |v_y| / U at the nip and above it, where the bed keeps its density, m, and its derivative by xi.
+    lag : float
+        Slip of the bed at the nip over y_n^2, 1/m2.
+    """
 
     half_gap: float
     height: float
     b: float
     c: float
-    nip: float
     xi: float
+    nip: float
+    flux: float
+    flux_by_xi: float
+    lag: float
 
 
 # --- motion -------------------------------------------------------------------------------------------------
 
 
-@_compiled
-def _line(bed, flow, xi):
-    """Return a streamline; the nip is at the height R sin(alpha)."""
-    nip = min(bed.radius * math.sin(flow.nip_angle), bed.height) if flow.nip_angle > 0 else bed.height
-    return Line(bed.half_gap, bed.height, bed.b, bed.c, nip, xi)
-
-
-@_compiled
+@_inner
 def _shape(line, y):
     """Return the half width X of the bed, m, X' and X'', 1/m."""
     outer = line.half_gap + y * y * (line.b + line.c * y)
     return outer, y * (2 * line.b + 3 * line.c * y), 2 * line.b + 6 * line.c * y
 
 
-@_compiled
+@_inner
+def _line(bed, flow, nip, xi):
+    """Return a streamline of a bed with its nip at the height `nip`, m."""
+    outer, slope = bed.half_gap + nip * nip * (bed.b + bed.c * nip), nip * (2 * bed.b + 3 * bed.c * nip)
+    kept, t = (1 - flow.slip) * outer, xi * slope
+    g = 1 / math.sqrt(1 + t * t)
+    lag = flow.slip / (nip * nip)
+    return Line(bed.half_gap, bed.height, bed.b, bed.c, xi, nip, kept * g, -kept * t * slope * g * g * g, lag)
+
+
+@_inner
 def _descent(line, flow, y, depth):
     """Return |v| and |v_y| over U, and the derivatives of the latter by xi and, along the streamline, by y."""
     outer, slope, curvature = _shape(line, y)
     t = line.xi * slope
     steep = 1 + t * t
-    if flow.law == NIP and y > line.nip:  # the bed keeps its density: |v_y| = g_n(xi) X_n / X
-        nip_outer, nip_slope, _ = _shape(line, line.nip)
-        nip_t = line.xi * nip_slope
-        g, wide = 1 / math.sqrt(1 + nip_t * nip_t), nip_outer / outer
-        return math.sqrt(steep) * g * wide, wide * g, -wide * nip_t * nip_slope * g * g * g, -wide * g * slope / outer
+    if flow.law == NIP and y > line.nip:
+        fall = line.flux / outer
+        return math.sqrt(steep) * fall, fall, line.flux_by_xi / outer, -fall * slope / outer
     g = 1 / math.sqrt(steep)
-    speed, by_y = 1.0, 0.0
+    speed, by_y = 1 - line.lag * y * y, -2 * line.lag * y
     if flow.law == POWER:
         linear = flow.exponent == 1.0
         speed = depth if linear else depth**flow.exponent
@@ -70,39 +91,30 @@ def _descent(line, flow, y, depth):
     return speed, speed * g, -turn * slope, by_y * g - turn * line.xi * curvature
 
 
-@_compiled
-def _gradient(line, flow, y, depth):
-    """Return |v| / U and the velocity gradient in U/H: v_xx, v_xy, v_yx, v_yy, where v_xy is the change of v_x by y.
+@_inner
+def _rates(line, flow, y, depth):
+    """Return |v| / U, volumetric (compaction positive) and triaxial shear strain rate in U/H, and `across`.
 
-    The velocity follows the streamline; its direction varies with x at fixed y because xi does.
+    The velocity follows the streamline; its direction varies with x at fixed y because xi does. `across` is
+    n.(-e').n over the shear rate, n normal to the streamline and e' the strain rate's deviator: 1 in uniaxial
+    compaction.
     """
     speed, fall, by_xi, by_y = _descent(line, flow, y, depth)
     outer, slope, curvature = _shape(line, y)
     t, v_y = line.xi * slope, -line.height * fall
     v_yx = -line.height * by_xi / outer
     v_yy = -line.height * (by_y - by_xi * t / outer)
-    t_x, t_y = slope / outer, line.xi * (curvature - slope * slope / outer)
-    return speed, t_x * v_y + t * v_yx, t_y * v_y + t * v_yy, v_yx, v_yy
-
-
-@_compiled
-def _deviator(v_xx, v_xy, v_yx, v_yy):
-    """Return xx, yy and xy of the strain rate's deviator in plane strain, and the shear rate sqrt(2/3 e':e')."""
+    v_xx = slope / outer * v_y + t * v_yx
+    v_xy = line.xi * (curvature - slope * slope / outer) * v_y + t * v_yy
     third = (v_xx + v_yy) / 3
     xx, yy, xy = v_xx - third, v_yy - third, (v_xy + v_yx) / 2
-    return xx, yy, xy, math.sqrt(2 / 3 * (xx * xx + yy * yy + third * third + 2 * xy * xy))
-
-
-@_compiled
-def _rates(line, flow, y, depth):
-    """Return |v| / U, volumetric (compaction positive) and triaxial shear strain rate in U/H."""
-    speed, v_xx, v_xy, v_yx, v_yy = _gradient(line, flow, y, depth)
-    _, _, _, shear = _deviator(v_xx, v_xy, v_yx, v_yy)
+    shear = math.sqrt(2 / 3 * (xx * xx + yy * yy + third * third + 2 * xy * xy))
+    across = (2 * t * xy - xx - t * t * yy) / ((1 + t * t) * shear) if shear > 0 else 0.0
     # above a nip 0 by construction: what is left is rounding
-    return speed, 0.0 if flow.nip_angle > 0 and y > line.nip else -(v_xx + v_yy), shear
+    return speed, 0.0 if flow.nip_angle > 0 and y > line.nip else -(v_xx + v_yy), shear, across
 
 
-@_compiled
+@_inner
 def _at(line, flow, place):
     """Return height and depth fraction of a place on the way up from the exit.
 
@@ -114,7 +126,7 @@ def _at(line, flow, place):
     return -line.height * math.expm1(-place), math.exp(-place)
 
 
-@_compiled
+@_inner
 def _slowness(line, flow, place):
     """Return the time it takes to cross a place, in H/U."""
     y, depth = _at(line, flow, place)
@@ -122,7 +134,7 @@ def _slowness(line, flow, place):
     return (1.0 if flow.nip_angle > 0 else depth) / fall
 
 
-@_compiled
+@_inner
 def _travel(line, flow, start, length):
     """Return the travel time down from the place start + length to `start`, by Gauss quadrature, in H/U."""
     total = 0.0
@@ -131,21 +143,7 @@ def _travel(line, flow, start, length):
     return length * total
 
 
-@_compiled
-def _panels(line, flow):
-    """Return the places between panels, exit to entry, on the mid-plane; the speed has a kink at the nip."""
-    edges = np.empty(_PANELS + 1)
-    # high enough, on the mid-plane, that in the same time no tube begins below the nip, already compacted
-    _, slope, _ = _shape(line, line.nip)
-    top = max(line.height * (1 - flow.entry_fraction), line.nip * math.sqrt(1 + slope * slope))
-    for k in range(_PANELS + 1):
-        share = 2 * k / _PANELS
-        past_nip = min(share, 1.0) * line.nip + max(share - 1, 0.0) * (top - line.nip)
-        edges[k] = past_nip / line.height if flow.nip_angle > 0 else -math.log(flow.entry_fraction) / 2 * share
-    return edges
-
-
-@_compiled
+@_inner
 def _march_back(line, flow, edges, duration, places):
     """Fill the places of a streamline's points, equal times apart, by Newton's method inside their panels."""
     last = j = places.size - 1
@@ -168,7 +166,7 @@ def _march_back(line, flow, edges, duration, places):
         passed += time
 
 
-@_compiled
+@_inner
 def _strain(line, flow, unit_time, time_step, places, y, volumetric_rate, shear_rate, volumetric, shear):
     """Fill the strains of the step that ends at each point, by the trapezoid rule.
 
@@ -187,34 +185,34 @@ def _strain(line, flow, unit_time, time_step, places, y, volumetric_rate, shear_
             past = share * time_step
         elif flow.nip_angle > 0 and y[j - 1] > line.nip:
             past = unit_time * _travel(line, flow, places[j], nip - places[j]) if y[j] < line.nip else 0.0
-            _, first_volumetric, first_shear = _rates(line, flow, line.nip, 1 - nip)
+            _, first_volumetric, first_shear, _ = _rates(line, flow, line.nip, 1 - nip)
             first_volumetric, first_shear = first_volumetric / unit_time, first_shear / unit_time
         volumetric[j] = (volumetric_rate[j] + first_volumetric) * past / 2
         shear[j] = (shear_rate[j] + first_shear) * past / 2
 
 
 @_compiled
-def lay(bed, flow, surface_speed, y, speed, volumetric_rate, shear_rate, volumetric, shear):
+def lay(bed, nip, flow, surface_speed, edges, y, speed, volumetric_rate, shear_rate, across, volumetric, shear):
     """Lay the material points; return the time step, s, and the closest that neighbours come in height, m.
 
-    Fills heights, m, speeds, m/s, and strain rates, 1/s, of the points, and the strains of the step that ends at each.
+    `edges` are the places between panels of quadrature, exit to entry, `nip` the height of the nip, m. Fills heights,
+    m, speeds, m/s, strain rates, 1/s, and `across` of the points, and the strains of the step that ends at each.
     """
     lines, points = y.shape
-    middle = _line(bed, flow, 0.0)
-    edges, places, unit_time = _panels(middle, flow), np.empty(points), bed.height / surface_speed
+    middle = _line(bed, flow, nip, 0.0)
+    places, unit_time = np.empty(points), bed.height / surface_speed
     duration, closest = 0.0, math.inf
     for k in range(_PANELS):
         duration += _travel(middle, flow, edges[k], edges[k + 1] - edges[k])
     time_step = duration * unit_time / (points - 1)
     for i in range(lines):
-        line = _line(bed, flow, bed.xi[i])
+        line = _line(bed, flow, nip, bed.xi[i])
         _march_back(line, flow, edges, duration, places)
         for j in range(points):
             y[i, j], depth = _at(line, flow, places[j])
-            relative, volumetric_rate[i, j], shear_rate[i, j] = _rates(line, flow, y[i, j], depth)
+            relative, volume, sheared, across[i, j] = _rates(line, flow, y[i, j], depth)
             speed[i, j] = surface_speed * relative
-            volumetric_rate[i, j] /= unit_time
-            shear_rate[i, j] /= unit_time
+            volumetric_rate[i, j], shear_rate[i, j] = volume / unit_time, sheared / unit_time
             if j > 0:
                 closest = min(closest, y[i, j - 1] - y[i, j])
         rates = volumetric_rate[i], shear_rate[i]
@@ -225,7 +223,7 @@ def lay(bed, flow, surface_speed, y, speed, volumetric_rate, shear_rate, volumet
 # --- stress -------------------------------------------------------------------------------------------------
 
 
-@_compiled
+@_inner
 def _response(elastic, eps_v, eps_s):
     """Return p and q of the state functions and the moduli p_v, p_s = q_v and q_s of the tangent, all over phi^3, Pa.
 
@@ -236,18 +234,22 @@ def _response(elastic, eps_v, eps_s):
         stiff = 1.0 if c == 0 else 0.0
         return 0.0, 0.0, stiff * bulk, 0.0, stiff * 3 * shear
     power, eta = eps_v**c, eps_s / eps_v
-    pressure = power * eps_v * (bulk / (c + 1) + 1.5 * shear * c * (eta * eta))
-    return (
-        pressure,
-        3 * shear * (power * eps_v) * eta,
-        power * (bulk + 1.5 * shear * c * (c - 1) * (eta * eta)),
-        power * 3 * shear * c * eta,
-        power * 3 * shear,
-    )
+    p = power * eps_v * (bulk / (c + 1) + 1.5 * shear * c * (eta * eta))
+    p_v = power * (bulk + 1.5 * shear * c * (c - 1) * (eta * eta))
+    return p, 3 * shear * (power * eps_v) * eta, p_v, power * 3 * shear * c * eta, power * 3 * shear
 
 
-@_compiled
-def _hold_strains(elastic, feed_solid_fraction, max_solid_fraction, volumetric, shear, eps_v, eps_s, phi, limited):
+@_inner
+def _stiffness(elastic, phi, feed, most):
+    """Return phi^3, times what it gains as pores close between the solid fractions `feed` and `most`."""
+    cube = phi * phi * phi
+    if elastic.densification == 0:
+        return cube
+    return cube * ((1 - feed / most) / (1 - min(phi / most, _DENSEST))) ** elastic.densification
+
+
+@_inner
+def _hold_strains(elastic, feed, most, volumetric, shear, eps_v, eps_s, phi, limited):
     """Fill strains and solid fractions of a streamline: running sums, shear held at the convexity limit."""
     sum_v = least_v = sum_s = least_s = 0.0
     for j in range(eps_v.size):
@@ -263,11 +265,11 @@ def _hold_strains(elastic, feed_solid_fraction, max_solid_fraction, volumetric, 
             # where the limit is tiny beside the plain sum, rounding would carry their difference past it
             eps_s[j] = min(max(sum_s + least_s, 0.0), limit)
             limited[j] = limit - sum_s <= least_s and eps_v[j] > 0
-        phi[j] = min(feed_solid_fraction * math.exp(eps_v[j]), max_solid_fraction)
+        phi[j] = min(feed * math.exp(eps_v[j]), most)
 
 
-@_compiled
-def _add_stresses(elastic, time_step, volumetric_rate, eps_v, eps_s, phi, p, q):
+@_inner
+def _add_stresses(elastic, feed, most, time_step, volumetric_rate, eps_v, eps_s, phi, p, q):
     """Fill the stresses of a streamline; return the lowest of their running sums, and of the state function of p.
 
     By increments of the state functions, or by Euler's rule, which takes rate and tangent at the start of the step
@@ -282,11 +284,10 @@ def _add_stresses(elastic, time_step, volumetric_rate, eps_v, eps_s, phi, p, q):
         if elastic.euler:
             begun = begun or volumetric_rate[j - 1] > 0
             d_v, d_s = volumetric_rate[j - 1] * time_step, eps_s[j] - eps_s[j - 1]
-            stiffness = phi[j - 1] * phi[j - 1] * phi[j - 1] if begun else 0.0
+            stiffness = _stiffness(elastic, phi[j - 1], feed, most) if begun else 0.0
             d_p, d_q = p_v * d_v + p_s * d_s, p_s * d_v + q_s * d_s
         else:
-            middle = (phi[j] + phi[j - 1]) / 2
-            stiffness = middle * middle * middle
+            stiffness = _stiffness(elastic, (phi[j] + phi[j - 1]) / 2, feed, most)
             d_p, d_q = new_p - state_p, new_q - state_q
         sum_p += stiffness * d_p
         least_p = min(least_p, sum_p)
@@ -300,82 +301,20 @@ def _add_stresses(elastic, time_step, volumetric_rate, eps_v, eps_s, phi, p, q):
 
 
 @_compiled
-def load(elastic, feed_solid_fraction, max_solid_fraction, time_step, volumetric_rate, volumetric, shear, state):
-    """March the stresses along every streamline; return whether the law asked for tension or reverse shear somewhere.
+def load(elastic, solid, time_step, volumetric_rate, volumetric, shear, eps_v, eps_s, phi, p, q, limited):
+    """March the stresses along every streamline; return the lowest running sums of p and q and state function of p.
 
-    `volumetric` and `shear` are the strains of the step that ends at each point. Fills `state`: strains, solid
-    fraction, mean stress p and triaxial shear stress q, Pa, and whether shear is held at the convexity limit. Strains
-    and stresses are held at 0 from below.
+    `solid` holds the solid fractions of the feed and at most, `volumetric` and `shear` the strains of the step that
+    ends at each point. Fills strains, solid fraction, mean stress p and triaxial shear stress q, Pa, and whether shear
+    is held at the convexity limit. Strains and stresses are held at 0 from below.
     """
-    eps_v, eps_s, phi, p, q, limited = state
-    least_p = least_q = least_state = highest_p = highest_q = 0.0
+    least_p = least_q = least_state = 0.0
     for i in range(p.shape[0]):
-        _hold_strains(
-            elastic,
-            feed_solid_fraction,
-            max_solid_fraction,
-            volumetric[i],
-            shear[i],
-            eps_v[i],
-            eps_s[i],
-            phi[i],
-            limited[i],
+        held = eps_v[i], eps_s[i], phi[i]
+        _hold_strains(elastic, solid[0], solid[1], volumetric[i], shear[i], held[0], held[1], held[2], limited[i])
+        stresses = _add_stresses(
+            elastic, solid[0], solid[1], time_step, volumetric_rate[i], held[0], held[1], held[2], p[i], q[i]
         )
-        lowest = _add_stresses(elastic, time_step, volumetric_rate[i], eps_v[i], eps_s[i], phi[i], p[i], q[i])
-        least_p, least_q, least_state = min(least_p, lowest[0]), min(least_q, lowest[1]), min(least_state, lowest[2])
-        for j in range(p.shape[1]):
-            highest_p, highest_q = max(highest_p, p[i, j]), max(highest_q, q[i, j])
-    # explicit steps from zero strain miss what the state functions say there; they do so for c < 0 only
-    return -least_p > _TENSION_NOISE * highest_p or -least_q > _TENSION_NOISE * highest_q or least_state < 0
-
-
-# --- what the machine feels ---------------------------------------------------------------------------------
-
-
-@_compiled
-def across(slope, v_xx, v_xy, v_yx, v_yy):
-    """Return n.(-e').n over the shear strain rate, n normal to a line of dx/dy = `slope`: 1 in uniaxial compaction.
-
-    With stress and strain rate coaxial the normal stress there is p + 2 q / 3 times this.
-    """
-    xx, yy, xy, shear = _deviator(v_xx, v_xy, v_yx, v_yy)
-    normal = (xx - 2 * slope * xy + slope * slope * yy) / (1 + slope * slope)
-    return -normal / shear if shear > 0 else 0.0
-
-
-@_compiled
-def wall_force(bed, flow, y, p, q):
-    """Return the integral of the normal stress over the height of the roll's streamline (point,), N/m."""
-    line = _line(bed, flow, 1.0)
-    force = old_normal = old_y = 0.0
-    for j in range(y.size):
-        normal, height = p[j], min(y[j], line.nip)
-        if q[j] > 0:
-            _, slope, _ = _shape(line, y[j])
-            _, v_xx, v_xy, v_yx, v_yy = _gradient(line, flow, y[j], 1 - y[j] / line.height)
-            normal += 2 / 3 * q[j] * across(slope, v_xx, v_xy, v_yx, v_yy)
-        if j > 0:
-            force += (old_y - height) * (normal + old_normal) / 2
-        old_normal, old_y = normal, height
-    return force
-
-
-@_compiled
-def power(bed, flow, y, speed, volumetric, shear, p, q):
-    """Return the work of stress on the compacting bed, both halves of the gap, W/m; the last streamline is the roll's.
-
-    Of the mid-plane's side the area between two points is X |v_y| dt / N.
-    """
-    tubes = y.shape[0] - 1
-    total = 0.0
-    for i in range(tubes):
-        line, old_flux = _line(bed, flow, bed.xi[i]), 0.0
-        for j in range(y.shape[1]):
-            outer, slope, _ = _shape(line, y[i, j])
-            t = line.xi * slope
-            flux = outer * speed[i, j] / math.sqrt(1 + t * t)
-            if volumetric[i, j] > 0:
-                work = (p[i, j] + p[i, j - 1]) / 2 * volumetric[i, j] + (q[i, j] + q[i, j - 1]) / 2 * shear[i, j]
-                total += (flux + old_flux) / 2 * work
-            old_flux = flux
-    return 2 / tubes * total
+        least_p, least_q = min(least_p, stresses[0]), min(least_q, stresses[1])
+        least_state = min(least_state, stresses[2])
+    return least_p, least_q, least_state

@@ -1,5 +1,6 @@
 """Motion of the bed: material points marched backwards from the exit, and strain rates (paper figure 3b, c)."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -8,6 +9,7 @@ from hpgr.bed import kernels
 from hpgr.bed.geometry import Geometry
 from hpgr.laws.flow import FlowConstants
 
+_PANELS = np.linspace(0.0, 1.0, 65)  # panels of quadrature, see hpgr.bed.kernels
 _CLOSEST = 1e-9  # spacing of points, as a fraction of the bed's height, below which they are one point
 
 
@@ -24,6 +26,9 @@ class Kinematics(NamedTuple):
         Speed along the streamline, m/s.
     volumetric_rate, shear_rate : ndarray
         Rates of volumetric (compaction positive) and triaxial shear strain, 1/s.
+    across : ndarray
+        Normal to the streamline, the deviator of the strain rate over the shear rate: 1 in uniaxial compaction.
+        With stress and strain rate coaxial the normal stress on the streamline is p + 2 q / 3 times this.
     time_step : float
         Time between neighbouring points, s.
     """
@@ -34,6 +39,7 @@ class Kinematics(NamedTuple):
     speed: np.ndarray
     volumetric_rate: np.ndarray
     shear_rate: np.ndarray
+    across: np.ndarray
     time_step: float
 
 
@@ -52,25 +58,34 @@ def move(geometry: Geometry, flow: FlowConstants, surface_speed: float, points: 
     ValueError
         If neighbouring points are closer than 1e-9 of the bed's height.
     """
-    y, speed, volumetric_rate, shear_rate, volumetric, shear = np.zeros((6, geometry.xi.size, points))
+    y, speed, *rates, across, volumetric, shear = np.zeros((7, geometry.xi.size, points))
     time_step = 0.0
     if geometry.height > 0:
-        rates = volumetric_rate, shear_rate
-        time_step, closest = kernels.lay(geometry, flow, surface_speed, y, speed, *rates, volumetric, shear)
+        nip, edges = nip_height(geometry, flow), _panels(geometry, flow)
+        time_step, closest = kernels.lay(
+            geometry, nip, flow, surface_speed, edges, y, speed, *rates, across, volumetric, shear
+        )
         _refuse_coinciding(closest / geometry.height, points, flow.entry_fraction)
     else:  # gap = entry gap: no bed to compact; every point is the exit
         speed += surface_speed
     steps = np.arange(points) / (points - 1)
-    kinematics = Kinematics(
-        x=geometry.xi[:, None] * geometry.outer(y),
-        y=y,
-        residence_time=steps * (time_step * (points - 1)),
-        speed=speed,
-        volumetric_rate=volumetric_rate,
-        shear_rate=shear_rate,
-        time_step=time_step,
-    )
-    return kinematics, StepStrains(volumetric, shear)
+    x, residence_time = geometry.xi[:, None] * geometry.outer(y), steps * (time_step * (points - 1))
+    return Kinematics(x, y, residence_time, speed, *rates, across, time_step), StepStrains(volumetric, shear)
+
+
+def nip_height(geometry: Geometry, flow: FlowConstants) -> float:
+    """Return the height of the nip, R sin(alpha), m, or of the bed if there is none."""
+    return min(geometry.radius * math.sin(flow.nip_angle), geometry.height) if flow.nip_angle else geometry.height
+
+
+def _panels(geometry: Geometry, flow: FlowConstants) -> np.ndarray:
+    """Return the places between panels, exit to entry, on the mid-plane; the speed has a kink at the nip."""
+    if flow.nip_angle == 0:
+        return _PANELS * -math.log(flow.entry_fraction)
+    # high enough, on the mid-plane, that in the same time no tube begins below the nip, already compacted
+    nip = nip_height(geometry, flow)
+    top = max(geometry.height * (1 - flow.entry_fraction), nip * math.hypot(1, geometry.slope(nip)))
+    return np.interp(_PANELS, (0.0, 0.5, 1.0), (0.0, nip, top)) / geometry.height
 
 
 def _refuse_coinciding(spacing: float, points: int, entry_fraction: float) -> None:

@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from hpgr.bed import kernels, kinematics, stress
+from hpgr.bed import kinematics, stress
 from hpgr.bed.geometry import Geometry, between_rolls, centres
 from hpgr.bed.kinematics import Kinematics, StepStrains
 from hpgr.bed.stress import StressState
-from hpgr.laws.elasticity import Elasticity
+from hpgr.laws.elasticity import ElasticConstants, Elasticity
 from hpgr.laws.flow import Flow, FlowConstants
+from hpgr.laws.roll_width import RollWidth
 from hpgr.scene import Scene
 
 if TYPE_CHECKING:  # GEOS loads with it
@@ -22,6 +23,7 @@ class BedInputs(NamedTuple):
     """All that a bed depends on, SI units: scenes of equal inputs share their bed."""
 
     diameter: float
+    width: float
     gap: float
     entry_gap: float
     speed: float
@@ -29,6 +31,7 @@ class BedInputs(NamedTuple):
     elasticity: Elasticity
     feed_solid_fraction: float
     max_solid_fraction: float
+    roll_width: RollWidth | None
     streamlines: int
     points: int
     tessellated: bool
@@ -37,10 +40,16 @@ class BedInputs(NamedTuple):
         """Return the bed with the streamlines `xi`."""
         return between_rolls(self.diameter, self.gap, self.entry_gap, xi)
 
-    def laws(self) -> tuple:
-        """Return profile, elastic law and solid fractions as the kernels take them."""
+    def laws(self) -> tuple[FlowConstants, ElasticConstants, tuple[float, float]]:
+        """Return profile, elastic law and solid fractions (feed, at most) as the kernels take them."""
         flow = self.flow.constants(self.gap, self.diameter, self.feed_solid_fraction)
-        return flow, self.elasticity.constants(), self.feed_solid_fraction, self.max_solid_fraction
+        return flow, self.elasticity.constants(), (self.feed_solid_fraction, self.max_solid_fraction)
+
+    def mean_pressure(self, geometry: Geometry, y, power: float = 1.0):
+        """Return the mean over the roll width of the pressure at height y to a power, relative to its middle's."""
+        if self.roll_width is None:
+            return 1.0
+        return self.roll_width.mean_pressure(2 * geometry.outer(y), self.width, power)
 
     @property
     def surface_speed(self) -> float:
@@ -56,20 +65,20 @@ class BedInputs(NamedTuple):
 def inputs_of(scene: Scene, tessellated: bool = False) -> BedInputs:
     """Return what the bed of `scene` depends on."""
     rolls, bed, grid = scene.rolls, scene.bed, scene.resolution
-    machine = rolls.diameter, rolls.gap, rolls.entry_gap, rolls.speed
-    laws = scene.flow, scene.elasticity, bed.feed_solid_fraction, bed.max_solid_fraction
+    machine = rolls.diameter, rolls.width, rolls.gap, rolls.entry_gap, rolls.speed
+    laws = scene.flow, scene.elasticity, bed.feed_solid_fraction, bed.max_solid_fraction, scene.roll_width
     return BedInputs(*machine, *laws, grid.streamlines, grid.points, tessellated)
 
 
 class Pressed(NamedTuple):
-    """What presses and drives the bed, per metre of a roll width with the same pressure all along.
+    """What presses and drives the bed, per metre of roll width.
 
     Attributes
     ----------
     force : float
-        Pressing force per width, the integral of the normal stress on the outermost streamline, N/m.
+        Pressing force per width, N/m.
     power : float
-        Work done on the compacting bed per width and time, both halves of the gap, W/m.
+        Work done on the bed per width and time, both halves of the gap, W/m.
     nip_angle : float
         Angle at which compaction begins at the roll, rad; 0 if it never does.
     """
@@ -107,16 +116,14 @@ def load_bed(inputs: BedInputs) -> LoadedBed:
     """
     xi, every = centres(inputs.streamlines), inputs.elasticity.substeps
     walled = inputs.between_rolls(np.append(xi, 1.0))  # the roll itself, whose force and power are wanted
-    flow, *elastic = inputs.laws()
-    motion, strains = kinematics.move(walled, flow, inputs.surface_speed, inputs.stress_points)
-    state = stress.load(*elastic, motion, strains)
+    motion, strains, state = bear(inputs, walled)
     bed = LoadedBed(
         walled._replace(xi=xi),
         motion._replace(
             residence_time=motion.residence_time[::every], time_step=every * motion.time_step, **_kept(motion, every)
         ),
         state._replace(continuity_solid_fraction=state.continuity_solid_fraction[:-1], **_kept(state, every)),
-        _press(walled, flow, motion, strains, state),
+        _press(inputs, walled, motion, strains, state),
         None,
     )
     return bed._replace(tessellation=_tessellated(inputs, bed)) if inputs.tessellated else bed
@@ -127,15 +134,59 @@ def _kept(part: NamedTuple, every: int) -> dict[str, np.ndarray]:
     return {name: field[:-1, ::every] for name, field in part._asdict().items() if np.ndim(field) == 2}
 
 
-def _press(walled: Geometry, flow: FlowConstants, motion: Kinematics, strains: StepStrains, state: StressState):
-    if walled.height == 0:
+def bear(inputs: BedInputs, geometry: Geometry) -> tuple[Kinematics, StepStrains, StressState]:
+    """Return motion, strains of steps and stresses on the streamlines of `geometry`, at the points of stress."""
+    flow, elastic, solid = inputs.laws()
+    motion, strains = kinematics.move(geometry, flow, inputs.surface_speed, inputs.stress_points)
+    return motion, strains, stress.load(elastic, solid, motion, strains)
+
+
+def force_on_roll(inputs: BedInputs, geometry: Geometry, motion: Kinematics, state: StressState) -> float:
+    """Return the pressing force per width, N/m: normal stress on the last streamline, the roll, over its height.
+
+    Past the gap the cake follows the rolls apart until it has recovered; it then adds to the force.
+    """
+    nip = kinematics.nip_height(geometry, inputs.laws()[0])
+    y, normal = motion.y[-1], _on_roll(motion, state)
+    pressing = normal * inputs.mean_pressure(geometry, y)
+    run = -np.diff(np.minimum(y, nip))
+    recovering = inputs.elasticity.recovering_force(normal[-1], inputs.gap, geometry.radius)
+    return float((pressing[1:] + pressing[:-1]) @ run / 2 + recovering * inputs.mean_pressure(geometry, 0.0, 1.5))
+
+
+def _on_roll(motion: Kinematics, state: StressState) -> np.ndarray:
+    """Return the normal stress on the last streamline (point,), Pa."""
+    return state.pressure[-1] + 2 / 3 * state.shear_stress[-1] * motion.across[-1]
+
+
+def _power(inputs: BedInputs, geometry: Geometry, motion: Kinematics, strains: StepStrains, state: StressState):
+    """Return the work of stress on the compacting bed per width and time, less what the cake gives back, W/m.
+
+    Of the mid-plane's side the area between two points is X |v_y| dt / N.
+    """
+    tubes = geometry.xi.size - 1
+    slope = geometry.xi[:, None] * geometry.slope(motion.y)
+    flux = geometry.outer(motion.y) * motion.speed / np.sqrt(1 + slope * slope)  # X |v_y|, m2/s
+    flux *= inputs.mean_pressure(geometry, motion.y)
+
+    def between(field):
+        return (field[:tubes, 1:] + field[:tubes, :-1]) / 2
+
+    volumetric, shear = (part[:tubes, 1:] for part in strains)
+    work = between(state.pressure) * volumetric + between(state.shear_stress) * shear
+    given_back = inputs.elasticity.recovered_energy(_on_roll(motion, state)[-1])
+    given_back *= inputs.gap * inputs.surface_speed * inputs.mean_pressure(geometry, 0.0, 2.0)
+    return float(2 / tubes * (between(flux) * work).sum(where=volumetric > 0) - given_back)
+
+
+def _press(inputs: BedInputs, geometry: Geometry, motion: Kinematics, strains: StepStrains, state: StressState):
+    if geometry.height == 0:
         return Pressed(0.0, 0.0, 0.0)
-    pressure, shear_stress = state.pressure, state.shear_stress
     first = int((motion.volumetric_rate[-1] > 0).argmax())
-    onset = flow.nip_angle or math.asin(motion.y[-1, first] / walled.radius)
+    onset = inputs.laws()[0].nip_angle or math.asin(motion.y[-1, first] / geometry.radius)
     return Pressed(
-        kernels.wall_force(walled, flow, motion.y[-1], pressure[-1], shear_stress[-1]),
-        kernels.power(walled, flow, motion.y, motion.speed, *strains, pressure, shear_stress),
+        force_on_roll(inputs, geometry, motion, state),
+        _power(inputs, geometry, motion, strains, state),
         onset if (strains.volumetric[-1] > 0).any() else 0.0,
     )
 

@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hpgr.bed import kernels, kinematics, stress
-from hpgr.bed.loaded import BedInputs, Pressed, inputs_of
+from hpgr.bed.loaded import BedInputs, Pressed, bear, force_on_roll, inputs_of
 from hpgr.fields import show
 from hpgr.scene import LEAST_GAP, STEEPEST_ENTRY, Scene
 
@@ -50,8 +49,7 @@ def performance(scene: Scene, pressed: Pressed, throughput: float) -> Performanc
     (3.64, 2000.0)
     """
     rolls = scene.rolls
-    carried = rolls.width * _mean_pressure(scene)
-    force, bed_power = pressed.force * carried, pressed.power * carried
+    force, bed_power = pressed.force * rolls.width, pressed.power * rolls.width
     power = bed_power + rolls.idle_torque * rolls.speed
     return Performance(
         pressing_force=force,
@@ -65,11 +63,6 @@ def performance(scene: Scene, pressed: Pressed, throughput: float) -> Performanc
     )
 
 
-def _mean_pressure(scene: Scene) -> float:
-    """Return the mean pressure over the roll width relative to that of its middle."""
-    return 1.0 if scene.roll_width is None else scene.roll_width.mean_pressure()
-
-
 def specific_pressing_force(scene: Scene) -> float:
     """Return the specific pressing force F/(D L) of `scene` at its own gap, Pa, from the roll's streamline alone.
 
@@ -80,17 +73,15 @@ def specific_pressing_force(scene: Scene) -> float:
     >>> 1e6 < machine.specific_pressing_force(hpgr.presets.industrial()) < 9e6
     True
     """
-    return _force_over_diameter(inputs_of(scene)) * _mean_pressure(scene)
+    return _force_over_diameter(inputs_of(scene))
 
 
 def _force_over_diameter(inputs: BedInputs) -> float:
     roll = inputs.between_rolls(np.ones(1))
     if roll.height == 0:
         return 0.0
-    flow, *elastic = inputs.laws()
-    motion, strains = kinematics.move(roll, flow, inputs.surface_speed, inputs.stress_points)
-    state = stress.load(*elastic, motion, strains)
-    return kernels.wall_force(roll, flow, motion.y[0], state.pressure[0], state.shear_stress[0]) / inputs.diameter
+    motion, _, state = bear(inputs, roll)
+    return force_on_roll(inputs, roll, motion, state) / inputs.diameter
 
 
 def operating_gap(scene: Scene, specific_pressing_force: float | str) -> float:
@@ -142,13 +133,13 @@ def float_gap(scene: Scene) -> Scene:
     if wanted is None:
         return scene
     flow = scene.flow.held(scene.rolls.gap, scene.rolls.diameter, scene.bed.feed_solid_fraction)
-    gap = _gap_carrying(inputs_of(scene)._replace(gap=0.0, flow=flow), wanted, _mean_pressure(scene))
+    gap = _gap_carrying(inputs_of(scene)._replace(gap=0.0, flow=flow), wanted)
     # copies skip validation, which would cost more than the root: its bounds are a scene's
     return scene.model_copy(update={"rolls": scene.rolls.model_copy(update={"gap": gap}), "flow": flow})
 
 
 @lru_cache(256)
-def _gap_carrying(inputs: BedInputs, wanted: float, mean_pressure: float) -> float:
+def _gap_carrying(inputs: BedInputs, wanted: float) -> float:
     """Return the gap at which a bed carries the specific pressing force `wanted`, Pa; the gap of `inputs` is unused."""
     from scipy.optimize import brentq  # late: loading it takes as long as a hundred gaps
 
@@ -163,7 +154,7 @@ def _gap_carrying(inputs: BedInputs, wanted: float, mean_pressure: float) -> flo
 
     @cache
     def force(log_gap: float) -> float:
-        return _force_over_diameter(inputs._replace(gap=math.exp(log_gap))) * mean_pressure
+        return _force_over_diameter(inputs._replace(gap=math.exp(log_gap)))
 
     def excess(log_gap: float) -> float:  # nearly straight in logs; without any force it is far below
         return math.log(max(force(log_gap) / wanted, _NO_FORCE))
@@ -193,9 +184,10 @@ def _refused(wanted: float) -> str:
 
 def _narrowest(inputs: BedInputs) -> tuple[float, str]:
     """Return the narrowest gap that can be, and what is below it."""
+    densest = inputs.elasticity.densest(inputs.max_solid_fraction)
     steepest = inputs.entry_gap - 0.9998 * STEEPEST_ENTRY * inputs.diameter
     return max(
         (max(_NARROWEST * inputs.diameter, LEAST_GAP), "no operating gap is looked for"),
         (steepest, "the bed would begin above 60 degrees, where a cubic streamline turns back"),
-        inputs.flow.narrowest_gap(inputs.diameter, inputs.feed_solid_fraction),
+        inputs.flow.narrowest_gap(inputs.diameter, inputs.feed_solid_fraction, densest),
     )

@@ -8,6 +8,8 @@ from hpgr.bed import kernels
 from hpgr.bed.kinematics import Kinematics, StepStrains
 from hpgr.laws.elasticity import ElasticConstants
 
+_TENSION_NOISE = 1e-9  # of the largest stress; less is rounding of the running sum
+
 
 class StressState(NamedTuple):
     """State of the bed at the material points; arrays are (streamline, point).
@@ -39,15 +41,14 @@ class StressState(NamedTuple):
 
 
 def load(
-    elastic: ElasticConstants,
-    feed_solid_fraction: float,
-    max_solid_fraction: float,
-    kinematics: Kinematics,
-    strains: StepStrains,
+    elastic: ElasticConstants, solid: tuple[float, float], kinematics: Kinematics, strains: StepStrains
 ) -> StressState:
-    """Return stresses and strains at the material points of `kinematics`."""
+    """Return stresses and strains at the material points; `solid` is the solid fraction of the feed and at most."""
     rate = kinematics.volumetric_rate
-    state = (*np.empty((5, *rate.shape)), np.empty(rate.shape, bool))
-    solid = feed_solid_fraction, max_solid_fraction
-    clamped = kernels.load(elastic, *solid, kinematics.time_step, rate, *strains, state)
-    return StressState(*state, feed_solid_fraction * np.exp(state[0][:, -1]), clamped)
+    fields = (*np.empty((5, *rate.shape)), np.empty(rate.shape, bool))
+    lowest = kernels.load(elastic, solid, kinematics.time_step, rate, *strains, *fields)
+    # explicit steps from zero strain miss what the state functions say there; they do so for c < 0 only
+    clamped = lowest[2] < 0 or any(
+        least < 0 and -least > _TENSION_NOISE * stress.max() for least, stress in zip(lowest, fields[3:5], strict=False)
+    )
+    return StressState(*fields, solid[0] * np.exp(fields[0][:, -1]), clamped)

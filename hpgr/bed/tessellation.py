@@ -62,8 +62,8 @@ def tessellate(geometry: Geometry, x: np.ndarray, y: np.ndarray, rim: np.ndarray
         pairs, ends = _shared_edges(whole)
         length = _length_within(domain, ends)
         cells = _clipped(domain, whole)
-    except shapely.errors.GEOSException as error:  # how the library tells of points that it cannot tell apart
-        raise ValueError(_lost(str(error), len(points))) from None
+    except shapely.errors.GEOSException:  # in words of its own, such as TopologyException
+        raise ValueError(_lost("their cells cannot be told apart", len(points))) from None
     kept = length > 0
     pairs, length = pairs[kept], length[kept]
     volume = shapely.area(cells)

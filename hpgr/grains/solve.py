@@ -103,7 +103,7 @@ def crush(scene: Scene, bed: LoadedBed, seed: int, replicate: int) -> Crushed | 
     if solver == "stress only":
         return None
     log_stress = scene.strength.log_stress(crushing_stress(scene, bed))
-    slices = WHOLE if scene.roll_width is None else scene.roll_width.cut()
+    slices = WHOLE if scene.roll_width is None else scene.roll_width.cut(scene.rolls.gap, scene.rolls.width)
     if solver == "closed form":
         return _closed_form(scene, log_stress, slices)
     if solver == "lattice":

@@ -16,6 +16,7 @@ class ElasticConstants(NamedTuple):
     bulk_modulus: float  # Pa
     shear_modulus: float  # Pa
     exponent: float
+    densification: float
 
 
 class GranularElasticity(Frozen):
@@ -23,7 +24,8 @@ class GranularElasticity(Frozen):
 
     Eq. 4 of the paper is the Hessian of psi when its eta is eps_s / eps_v; the paper's words have that ratio upside
     down. Bound: psi is convex up to `largest_shear_ratio`; shear beyond it is taken as plastic. Closed limit: at
-    constant phi any path adds up to phi^3 times the state functions.
+    constant phi any path adds up to `stiffness` times the state functions. Densification and recovery are ours, for
+    real machines; without them the law is the paper's.
 
     Examples
     --------
@@ -43,6 +45,18 @@ class GranularElasticity(Frozen):
     """Scaling of the bed's shear modulus."""
     exponent: Number = quantity(0.5, symbol="c", source="paper eq. 4; value ours (Hertz)", example=0.5, gt=-1, le=10)
     """Pressure sensitivity of granular elasticity."""
+    densification: Number = quantity(0.0, symbol="k_d", source="ours (0, the paper; 3 fitted)", example=3, ge=0, le=20)
+    """How the bed stiffens as pores close: phi^3 gains [(1 - phi_feed/phi_max) / (1 - phi/phi_max)]^k_d."""
+    recovery_modulus: Pascals | None = quantity(
+        None,
+        symbol="E_r",
+        unit="Pa",
+        source="ours (none, the paper; 3.3 GPa fitted)",
+        example="3.3 GPa",
+        ge=1e3,
+        le=1e15,
+    )
+    """Modulus of the cake past the gap, which follows the rolls apart until its stress is gone; None: it does not."""
     integrator: Literal["increment", "euler"] = "increment"
     """'increment': increments of the state functions, exact at constant solid fraction (ours); 'euler': the paper's
     explicit rule.
@@ -69,6 +83,28 @@ class GranularElasticity(Frozen):
             scale * 3 * shear,
         )
 
+    def stiffness(self, phi, feed_solid_fraction: float, max_solid_fraction: float):
+        """Return what state functions and moduli are multiplied by: phi^3, and what it gains as pores close."""
+        closing = (1 - feed_solid_fraction / max_solid_fraction) / (1 - phi / max_solid_fraction)
+        return phi**3 * closing**self.densification
+
+    def densest(self, max_solid_fraction: float) -> float:
+        """Return the solid fraction beyond which nothing can be pressed."""
+        return max_solid_fraction if self.densification > 0 else 1.0
+
+    def recovering_force(self, normal: float, gap: float, radius: float) -> float:
+        """Return the force per width past the gap of a cake pressed to the stress `normal` there, N/m.
+
+        Stress falls linearly with the strain over the angle theta, theta^2 = s_b normal / (E_r R): 2/3 R theta normal.
+        """
+        if self.recovery_modulus is None or normal <= 0:
+            return 0.0
+        return 2 / 3 * math.sqrt(gap * radius * normal / self.recovery_modulus) * normal
+
+    def recovered_energy(self, normal: float) -> float:
+        """Return the energy that such a cake gives back to the rolls per volume, J/m3."""
+        return 0.0 if self.recovery_modulus is None else normal * normal / (2 * self.recovery_modulus)
+
     def largest_shear_ratio(self) -> float:
         """Return eta_max = sqrt(2 K / (3 G c (c+1))), where the energy stops being convex; inf for c <= 0."""
         c = self.exponent
@@ -76,7 +112,7 @@ class GranularElasticity(Frozen):
 
     def constants(self) -> ElasticConstants:
         """Return the law as the kernels take it."""
-        moduli = self.bulk_modulus, self.shear_modulus, self.exponent
+        moduli = self.bulk_modulus, self.shear_modulus, self.exponent, self.densification
         return ElasticConstants(self.integrator == "euler", self.largest_shear_ratio(), *moduli)
 
 

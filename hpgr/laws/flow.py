@@ -23,6 +23,7 @@ class FlowConstants(NamedTuple):
     entry_fraction: float
     nip_angle: float = 0.0  # rad
     exponent: float = 0.0
+    slip: float = 0.0
 
 
 class _Profile(Frozen):
@@ -33,7 +34,7 @@ class _Profile(Frozen):
         """Return the profile with what is held while the gap floats; by default nothing."""
         return self
 
-    def narrowest_gap(self, diameter: float, feed_solid_fraction: float) -> tuple[float, str]:
+    def narrowest_gap(self, diameter: float, feed_solid_fraction: float, densest: float) -> tuple[float, str]:
         """Return the gap to which the held profile reaches down, m, and what is below it; by default any gap is."""
         return 0.0, ""
 
@@ -63,13 +64,14 @@ class PowerFlow(_Profile):
 
 
 class NipFlow(_Profile):
-    """The bed moves with the rolls from the nip down, |v| = U, and keeps the feed's density above it (real machines).
+    """The rolls carry the bed from the nip down, and it keeps the feed's density above (real machines).
 
-    The nip lies at the height R sin(alpha). Above it continuity fixes the vertical speed on a streamline that passes
-    the nip with the slope t_n: |v_y| = U (1 + t_n^2)^(-1/2) X_n / X, X the half width of the bed. Closed limit: the
-    volumetric strain is the logarithm of the tube's density ratio. Bound: see `densest_ratio`.
+    The nip lies at the height y_n = R sin(alpha). Below it |v| = U [1 - slip (y/y_n)^2]; above it continuity fixes
+    the vertical speed on a streamline that passes the nip with the slope t_n: |v_y| = U (1 - slip) (1 + t_n^2)^(-1/2)
+    X_n / X, X the half width of the bed. Closed limit: without slip |v| = U below the nip, and the volumetric strain is
+    the logarithm of the tube's density ratio. Bound: see `densest_ratio`.
 
-    Source: nip and cake of Torres & Casali, Minerals Engineering 22 (2009) 1137-1146; speed above the nip ours.
+    Source: nip and cake of Torres & Casali, Minerals Engineering 22 (2009) 1137-1146; speeds ours.
 
     Examples
     --------
@@ -88,6 +90,9 @@ class NipFlow(_Profile):
     )
     """Solid fraction of the pressed cake, from which the nip angle follows."""
 
+    slip: Number = quantity(0.0, symbol="lambda", source="ours (0; 0.33 fitted)", example=0.33, ge=0, le=0.9)
+    """Part of the rolls' speed by which the bed lags behind them at the nip."""
+
     @classmethod
     def _impossible(cls, known: dict[str, Any]) -> Iterator[Fault]:
         names = ("nip_angle", "cake_solid_fraction")
@@ -98,11 +103,13 @@ class NipFlow(_Profile):
                 names[0], " and ".join(given) or "nothing", bound, "give one, such as cake_solid_fraction = 0.85"
             )
 
-    def vertical_speed(self, slope, half_width, nip_slope, nip_half_width):
-        """Return |v_y| / U where the streamline has the slope dx/dy and the bed a half width; both at the nip too."""
-        above = np.real(half_width) > np.real(nip_half_width)
-        kept = nip_half_width / half_width / np.sqrt(1 + nip_slope * nip_slope)
-        return np.where(above, kept, 1 / np.sqrt(1 + slope * slope))
+    def vertical_speed(self, height, slope, half_width, nip_slope, nip_half_width):
+        """Return |v_y| / U at the height y/y_n, where the streamline has the slope dx/dy and the bed a half width.
+
+        `nip_slope` and `nip_half_width` are those of the streamline and of the bed at the nip.
+        """
+        kept = (1 - self.slip) * nip_half_width / half_width / np.sqrt(1 + nip_slope * nip_slope)
+        return np.where(np.real(height) > 1, kept, (1 - self.slip * height * height) / np.sqrt(1 + slope * slope))
 
     def angle(self, gap: float, diameter: float, feed_solid_fraction: float) -> float:
         """Return the nip angle, as given or from the cake's solid fraction, rad.
@@ -115,13 +122,13 @@ class NipFlow(_Profile):
         """
         if self.nip_angle is not None:
             return self.nip_angle
-        return cake_nip_angle(gap, diameter, self.cake_solid_fraction / feed_solid_fraction)
+        return cake_nip_angle(gap, diameter, self.cake_solid_fraction / feed_solid_fraction, self.slip)
 
-    def narrowest_gap(self, diameter: float, feed_solid_fraction: float) -> tuple[float, str]:
-        """Return the gap at which the nip angle given makes a cake of solid rock, m, and why it is the narrowest."""
-        kept = feed_solid_fraction * math.cos(self.nip_angle)
-        solid = kept * diameter * (1 - math.cos(self.nip_angle)) / (1 - kept) if kept < 1 else math.inf
-        return solid, "the cake would be denser than rock"
+    def narrowest_gap(self, diameter: float, feed_solid_fraction: float, densest: float) -> tuple[float, str]:
+        """Return the gap at which the nip angle given makes a cake as dense as can be, m, and what is below it."""
+        kept = (1 - self.slip) * feed_solid_fraction / densest * math.cos(self.nip_angle)
+        gap = kept * diameter * (1 - math.cos(self.nip_angle)) / (1 - kept) if kept < 1 else math.inf
+        return gap, "the cake would be denser than " + ("rock" if densest == 1 else f"max_solid_fraction {densest:g}")
 
     def widest_gap(self, diameter: float, entry_gap: float) -> float:
         """Return the gap at which the nip angle given reaches the top of the bed, m."""
@@ -134,21 +141,22 @@ class NipFlow(_Profile):
 
     def constants(self, gap: float, diameter: float, feed_solid_fraction: float) -> FlowConstants:
         """Return the profile as the kernels take it."""
-        return FlowConstants(NIP, self.entry_fraction, self.angle(gap, diameter, feed_solid_fraction))
+        return FlowConstants(NIP, self.entry_fraction, self.angle(gap, diameter, feed_solid_fraction), slip=self.slip)
 
 
-def cake_nip_angle(gap: float, diameter: float, ratio: float) -> float:
+def cake_nip_angle(gap: float, diameter: float, ratio: float, slip: float = 0.0) -> float:
     """Return the nip angle of a cake `ratio` times as dense as the feed, at most `densest_ratio`, rad.
 
-    From continuity between nip and gap, (s_b + D (1 - cos alpha)) cos alpha = ratio s_b (Torres & Casali 2009).
+    From continuity between nip and gap, (1 - slip) (s_b + D (1 - cos alpha)) cos alpha = ratio s_b (Torres & Casali
+    2009, without slip).
     """
-    room = max((gap + diameter) ** 2 - 4 * gap * diameter * ratio, 0.0)
+    room = max((gap + diameter) ** 2 - 4 * gap * diameter * ratio / (1 - slip), 0.0)
     return math.acos(min(((gap + diameter) + math.sqrt(room)) / (2 * diameter), 1.0))
 
 
-def densest_ratio(gap: float, diameter: float) -> float:
+def densest_ratio(gap: float, diameter: float, slip: float = 0.0) -> float:
     """Return the largest density of cake over feed that any nip angle makes."""
-    return (gap + diameter) ** 2 / (4 * gap * diameter)
+    return (1 - slip) * (gap + diameter) ** 2 / (4 * gap * diameter)
 
 
 Flow = Annotated[PowerFlow | NipFlow, Field(discriminator="kind"), default_kind("power")]
