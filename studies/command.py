@@ -324,7 +324,7 @@ def _refuse_foreign(path: Path, line: str, overwrite: bool) -> None:
         raise ValueError(f"--out: got {path}, which is read-only; {remedy}")
     maker = _maker(path)
     if maker is None:
-        raise ValueError(f"--out: got {path}, which no study has written; {remedy}")
+        raise ValueError(f"--out: got {path}, which is no whole result of a study; {remedy}")
     same = _named(maker)[:1] == _named(line)[:1] and (path.suffix != ".nc" or _named(maker) == _named(line))
     if not same:
         raise ValueError(f"--out: got {path}, which is the result of another command, `{maker}`; {remedy}")
@@ -348,7 +348,10 @@ def _maker(path: Path) -> str | None:
 
 def _named(line: str) -> tuple[str, str]:
     """Return the study and the scenes that a command line names."""
-    words = shlex.split(line.replace(" --scene=", " --scene "))
+    try:
+        words = shlex.split(line.replace(" --scene=", " --scene "))
+    except ValueError:  # quotes that nobody closed: it is no command line, but somebody's
+        return line, ""
     scenes = words[words.index("--scene") + 1 :] if "--scene" in words else []
     return words[2], " ".join(itertools.takewhile(lambda word: not word.startswith("-"), scenes))
 

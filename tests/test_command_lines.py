@@ -108,27 +108,19 @@ def test_defaults(run, folder, name):
         assert "speed changes throughput and nothing else" in out
 
 
-def test_further_axes(run):
-    code, out, _ = run(
-        *("--gap", "40 mm", "0.05 m", "--roll-speed", "15 rpm", "2 rad/s", "--feed-top-size", "5 cm", "60 mm"),
-        *("--replicates", "1", "--out", "all"),
-        study=speed_sweep,
-    )
+def test_further_axes_come_after_the_study_s_own(run):
+    axes = ("--gap", "40 mm", "0.05 m", "--feed-top-size", "5 cm", "60 mm")
+    code, out, _ = run(*axes, "--replicates", "1", "--no-plot", study=speed_sweep)
     assert code == 0
-    result = opened("all.nc")
+    result = opened("outputs/speed_sweep.nc")
     dims = ("roll_speed", "gap", "feed_top_size")
     assert result["p80_total"].dims == (*dims, "replicate")
     assert result["gap"].values.tolist() == [0.04, 0.05]
-    assert result["roll_speed"].values == pytest.approx([np.pi / 2, 2], rel=1e-12)
+    assert result.sizes["roll_speed"] == 6
     assert result["feed_top_size"].values == pytest.approx([0.05, 0.06], rel=1e-12)
     headings = ["roll speed [rpm]", "gap [mm]", "feed top size [mm]"]
     assert re.split(r"\s{2,}", out.splitlines()[0].strip())[:3] == headings
     assert "±" not in out
-
-
-def test_default_main_axis_comes_before_further_axes(run):
-    assert run("--gap", "40 mm", "50 mm", "--replicates", "1", "--no-plot", study=speed_sweep)[0] == 0
-    assert opened("outputs/speed_sweep.nc")["throughput"].shape == (6, 2, 1)
 
 
 def test_table_agrees_with_the_file(run):
@@ -174,14 +166,6 @@ def test_level_sets_the_resolution_and_nothing_else(folder):
     assert command.base_scene("paper", level="draft").resolution.level().startswith("draft")
 
 
-def test_stress_only(run, folder):
-    code, out, _ = run("--gap", "40 mm", "50 mm", "--cells", "0")
-    assert code == 0
-    assert re.split(r"\s{2,}", out.splitlines()[0].strip()) == ["gap [mm]", "throughput [t/h]", "peak pressure [MPa]"]
-    assert files(folder) == ["outputs/gap_sweep.nc", "outputs/gap_sweep.png"]
-    assert "passing" not in opened("outputs/gap_sweep.nc")
-
-
 def test_dry_run_lists_cases_and_writes_nothing(run, folder):
     axes = ("--gap", "40 mm", "1.2 m", "--roll-speed", "15 rpm", "19 rpm")
     code, out, err = run(*axes, "--dry-run")
@@ -222,15 +206,6 @@ def test_second_run_reads_every_case_back(run, folder, monkeypatch):
     code, _, err = run("--gap", "40 mm", "--no-plot", "--recompute")
     assert code == 1
     assert "failed: gap 40 mm, 3 of 3 replicates" in err  # nothing was read back
-
-
-def test_cases_recorded_whole(run):
-    import studies
-
-    assert run("--gap", "40 mm", "60 mm", "--replicates", "2", "--no-plot", "--record", "distributions")[0] == 0
-    cases = studies.open_cases("outputs/gap_sweep.cases")
-    assert dict(cases["mass_fraction"].sizes)["gap"] == 2
-    assert np.allclose(cases["mass_fraction"].sum("sieve").compute(), 1, atol=1e-6)
 
 
 def test_scene_from_toml_and_json(run, folder):
@@ -386,13 +361,6 @@ def test_feed_of_one_size_has_no_top_size(refused, folder):
     assert "of a single size" in message
 
 
-def test_scene_too_large_for_this_machine(run):
-    code, _, err = run("--gap", "40 mm", "--cells", "2000000000", "--streamlines", "10000", "--replicates", "1")
-    assert code == 1
-    assert "predicted" in err
-    assert "bytes" in err
-
-
 def test_unreachable_scheduler_is_refused(folder, run, monkeypatch):
     import distributed
 
@@ -422,11 +390,11 @@ def test_interrupt_says_how_to_go_on(run, monkeypatch):
 GAP = ("--gap", "40 mm", "--replicates", "1")
 
 
-@pytest.mark.parametrize(("given", "made"), [("deep/run.nc", "deep/run"), ("run", "run"), ("run.v2", "run.v2")])
-def test_out(run, folder, given, made):
-    assert run(*GAP, "--out", given)[0] == 0
-    assert files(folder) == [f"{made}.nc", f"{made}.png"]
-    assert (folder / f"{made}.cases" / "lock").is_file()
+def test_out(run, folder):
+    for given, made in (("deep/run.nc", "deep/run"), ("run", "run"), ("run.v2", "run.v2")):
+        assert run(*GAP, "--no-plot", "--out", given)[0] == 0
+        assert (folder / f"{made}.cases" / "lock").is_file()
+    assert files(folder) == ["deep/run.nc", "run.nc", "run.v2.nc"]
 
 
 def test_out_that_cannot_be_written(refused, folder):
@@ -438,7 +406,7 @@ def test_out_that_cannot_be_written(refused, folder):
 
 def test_earlier_result_of_the_same_study_is_extended(run):
     assert run(*GAP)[0] == 0
-    assert run("--gap", "40 mm", "50 mm", "--replicates", "2")[0] == 0
+    assert run("--gap", "40 mm", "50 mm", "--replicates", "1")[0] == 0
     assert opened("outputs/gap_sweep.nc").sizes["gap"] == 2
 
 
@@ -453,7 +421,7 @@ def test_file_that_is_not_the_study_s_own_is_replaced_only_if_asked(run, refused
             if foreign.startswith(b"\x89PNG"):
                 continue  # its mark is in its first half
             path.write_bytes(foreign)
-            assert f"--out: got {path.name}, which no study has written" in refused(*GAP, "--out", "mine")
+            assert f"--out: got {path.name}, which is no whole result of a study" in refused(*GAP, "--out", "mine")
         path.write_bytes(content)
     (folder / "mine.nc").chmod(0o444)
     assert "read-only" in refused(*GAP, "--out", "mine")

@@ -180,18 +180,6 @@ def test_cases_in_flight_are_few(base, client, tmp_path, monkeypatch):
     assert most[0] <= 4  # 2 for the one thread, one being written, one just begun
 
 
-def test_cases_that_reach_elsewhere_are_refused(base, client, tmp_path):
-    import h5py
-
-    sweep(base, {"rolls.gap": [0.04]}, client=client, folder=tmp_path, record="distributions")
-    [path] = tmp_path.glob("*.nc")
-    (tmp_path / "secret").write_bytes(b"key!")
-    with h5py.File(path, "r+") as file:
-        file.create_dataset("b", (4,), "u1", external=[(str(tmp_path / "secret"), 0, 4)])
-    with pytest.raises(ValueError, match="/b has its values in other files"):
-        studies.open_cases(tmp_path)
-
-
 def test_nothing_is_unpickled_from_disk(base, client, tmp_path, monkeypatch):
     """Reading back, opening and dry runs never reach for pickle, nor for what would on their behalf."""
     import pickle
@@ -207,18 +195,3 @@ def test_nothing_is_unpickled_from_disk(base, client, tmp_path, monkeypatch):
     assert studies.open_cases(tmp_path).sizes["gap"] == 1
     for module in ("cases", "assemble", "netcdf", "isolated"):
         assert "pickle" not in vars(sys.modules[f"studies.sweep.{module}"])
-
-
-def test_manifest_is_whole_or_not_at_all(base, client, tmp_path, monkeypatch):
-    options = {"client": client, "folder": tmp_path, "record": "distributions"}
-    sweep(base, {"rolls.gap": [0.04]}, **options)
-    before = (tmp_path / "sweep.json").read_bytes()
-
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(netcdf, "replace", full)
-        with pytest.raises(OSError, match="No space"):
-            sweep(base, {"rolls.gap": [0.04]}, **options)
-    assert (tmp_path / "sweep.json").read_bytes() == before

@@ -42,14 +42,11 @@ def counted(monkeypatch):
 
 def test_finished_cases_are_not_computed_again(base, client, tmp_path, counted):
     without = sweep(base, {"rolls.gap": GAPS}, 2, client=client)
-    counted.clear()
-    first = sweep(base, {"rolls.gap": GAPS}, 2, client=client, folder=tmp_path)
-    assert len(counted) == 6
-    counted.clear()
-    second = sweep(base, {"rolls.gap": GAPS}, 2, client=client, folder=tmp_path)
-    assert counted == []
-    xr.testing.assert_identical(first, without)
-    xr.testing.assert_identical(second, without)
+    for computed in (6, 0):
+        counted.clear()
+        found = sweep(base, {"rolls.gap": GAPS}, 2, client=client, folder=tmp_path)
+        assert len(counted) == computed
+        xr.testing.assert_identical(found, without)
 
 
 def test_extending_and_reordering_compute_what_is_new_only(base, client, tmp_path, counted):
@@ -66,24 +63,14 @@ def test_extending_and_reordering_compute_what_is_new_only(base, client, tmp_pat
     assert counted == []
 
 
-def test_another_seed_scene_or_tolerance_is_another_case(base, client, tmp_path, counted):
-    sweep(base, {"rolls.gap": [0.05]}, client=client, folder=tmp_path)
-    for scene, options in [(base, {"seed": 1}), (base.with_values({"rolls.speed": 3}), {}), (base, {"tolerance": 0.3})]:
+def test_another_seed_scene_tolerance_or_code_is_another_case(base, client, tmp_path, counted, monkeypatch):
+    first = sweep(base, {"rolls.gap": [0.05]}, client=client, folder=tmp_path)
+    other = base.with_values({"rolls.speed": 3})
+    for scene, options in [(base, {"seed": 1}), (other, {}), (base, {"tolerance": 0.3}), (base, {"recompute": True})]:
         counted.clear()
-        sweep(scene, {"rolls.gap": [0.05]}, client=client, folder=tmp_path, **options)
+        again = sweep(scene, {"rolls.gap": [0.05]}, client=client, folder=tmp_path, **options)
         assert counted
-
-
-def test_recompute_computes_all_again(base, client, tmp_path, counted):
-    first = sweep(base, {"rolls.gap": GAPS}, client=client, folder=tmp_path)
-    counted.clear()
-    again = sweep(base, {"rolls.gap": GAPS}, client=client, folder=tmp_path, recompute=True)
-    assert len(counted) == 3
     xr.testing.assert_identical(again, first)
-
-
-def test_changed_code_computes_anew(base, client, tmp_path, counted, monkeypatch):
-    sweep(base, {"rolls.gap": [0.05]}, client=client, folder=tmp_path)
     for module in (cases, run):
         monkeypatch.setattr(module, "code_version", lambda: "edited")
     counted.clear()

@@ -28,7 +28,7 @@ import time
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -67,16 +67,9 @@ def code_version() -> str:
     data = (path for path in package.rglob("*") if path.suffix in {".py", ".csv", ".toml"})
     for path in [*sorted(data), Path(__file__).with_name("run.py")]:
         digest.update(f"{path.name} {path.stat().st_size}\n".encode() + path.read_bytes())
-    versions = {name: _version(name) for name in ("hpgr", "numpy", "numba", "llvmlite", "scipy", "shapely")}
+    versions = {name: version(name) for name in ("hpgr", "numpy", "numba", "llvmlite", "scipy", "shapely")}
     digest.update(repr((versions, os.environ.get("NUMBA_DISABLE_JIT", "0"))).encode())
     return digest.hexdigest()
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "unknown"
 
 
 class Addresses:
