@@ -314,6 +314,15 @@ def test_feed_that_no_stress_breaks_is_flagged_with_its_share():
     assert "feed_below_critical" not in flags(simulate(fine.with_values({"strength.scatter": 3})))
 
 
+def test_fragment_exponents_that_are_held_are_flagged_with_the_parents():
+    steep = {"fragments.size_exponent": 3.0, "fragments.exponent": 4.0, "fragments.reference_size": 0.05}
+    ds = simulate(paper(steep))
+    assert "fragment_exponent_held" in flags(ds)
+    assert "is held at 0.05 for parents of" in ds.attrs["diagnostics"]
+    assert "and 5 for parents of 60 mm" in ds.attrs["diagnostics"]
+    assert "fragment_exponent_held" not in flags(simulate(paper({"fragments.size_exponent": 0.1})))
+
+
 def test_tension_is_flagged():
     ds = simulate(paper({"resolution.cells": 0, "elasticity.exponent": -0.5}))
     assert {"tension_clamped", "no_limit_of_steps"} <= flags(ds)

@@ -10,6 +10,7 @@ from hpgr.bed.loaded import LoadedBed
 from hpgr.bed.machine import Performance
 from hpgr.fields import show, values_of
 from hpgr.grains.solve import Crushed, crushing_stress
+from hpgr.laws.fragments import HELD
 from hpgr.scene import Scene
 
 _NIPPING = 1.5  # top size over gap above which rolls nip single grains, which is not modelled
@@ -153,14 +154,29 @@ def _no_breakage(run: Run) -> str:
 
 
 def _feed_below_critical(run: Run) -> str:
-    strength, crushed = run.scene.strength, run.crushed
-    if crushed is None or not crushed.breaks.any() or math.isfinite(values_of(strength).get("scatter", math.inf)):
+    scattered = math.isfinite(values_of(run.scene.strength).get("scatter", math.inf))
+    if run.crushed is None or not run.crushed.breaks.any() or scattered:
         return ""
-    largest = crushing_stress(run.scene, run.bed).max()
-    critical = float(strength.critical_size(strength.log_stress(largest)))
+    critical = _critical_size(run)
     share = float(run.scene.feed.passing(np.nextafter(critical, 0.0)))
     words = f"{share:.3g} of the feed is finer than {show(critical, 'm', 3)}, which no stress of this bed breaks"
     return words if share > _UNBROKEN else ""
+
+
+def _critical_size(run: Run) -> float:
+    """Return the size in m that the largest stress of the bed just breaks without cushioning."""
+    strength = run.scene.strength
+    return float(strength.critical_size(strength.log_stress(crushing_stress(run.scene, run.bed).max())))
+
+
+def _fragment_exponent_held(run: Run) -> str:
+    law, largest = run.scene.fragments, run.scene.feed.largest_grain
+    if run.crushed is None or not values_of(law).get("size_exponent"):
+        return ""
+    parents = (min(max(_critical_size(run), law.size_floor), largest), largest)
+    held = [size for size in parents if float(law.exponent_of(size)) in HELD]
+    told = " and ".join(f"{float(law.exponent_of(size)):g} for parents of {show(size, 'm', 3)}" for size in held)
+    return f"the exponent of fragments is held at {told}, beyond which no measurement reaches" if held else ""
 
 
 def _size_floor_reached(run: Run) -> str:
@@ -184,6 +200,7 @@ FLAGS = (  # in the order in which they are told
     Flag("no_force_angle", 256, "more power than the force can give at any angle", _no_force_angle),
     Flag("no_breakage", 1, "no grain broke: the product is the feed", _no_breakage),
     Flag("feed_below_critical", 1024, "part of the feed is finer than any stress breaks", _feed_below_critical),
+    Flag("fragment_exponent_held", 2048, "the exponent of fragments left its range", _fragment_exponent_held),
     Flag("size_floor_reached", 16, "part of the product is below the size floor", _size_floor_reached),
     Flag("few_cells", 32, "with 2 or 3 cells every cell neighbours every other", _few_cells),
 )
