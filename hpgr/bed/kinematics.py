@@ -68,8 +68,7 @@ def move(geometry: Geometry, flow: FlowConstants, surface_speed: float, points: 
         _refuse_coinciding(closest / geometry.height, points, flow.entry_fraction)
     else:  # gap = entry gap: no bed to compact; every point is the exit
         speed += surface_speed
-    steps = np.arange(points) / (points - 1)
-    x, residence_time = geometry.xi[:, None] * geometry.outer(y), steps * (time_step * (points - 1))
+    x, residence_time = geometry.xi[:, None] * geometry.outer(y), np.arange(points) * time_step
     return Kinematics(x, y, residence_time, speed, *rates, across, time_step), StepStrains(volumetric, shear)
 
 

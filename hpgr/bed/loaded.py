@@ -146,12 +146,14 @@ def force_on_roll(inputs: BedInputs, geometry: Geometry, motion: Kinematics, sta
 
     Past the gap the cake follows the rolls apart until it has recovered; it then adds to the force.
     """
-    nip = kinematics.nip_height(geometry, inputs.laws()[0])
+    flow, _, _ = inputs.laws()
     y, normal = motion.y[-1], _on_roll(motion, state)
-    pressing = normal * inputs.mean_pressure(geometry, y)
-    run = -np.diff(np.minimum(y, nip))
+    pressing, low = normal * inputs.mean_pressure(geometry, y), np.minimum(y, kinematics.nip_height(geometry, flow))
     recovering = inputs.elasticity.recovering_force(normal[-1], inputs.gap, geometry.radius)
-    return float((pressing[1:] + pressing[:-1]) @ run / 2 + recovering * inputs.mean_pressure(geometry, 0.0, 1.5))
+    return float(
+        (pressing[1:] + pressing[:-1]) @ (low[:-1] - low[1:]) / 2
+        + recovering * inputs.mean_pressure(geometry, 0.0, 1.5)
+    )
 
 
 def _on_roll(motion: Kinematics, state: StressState) -> np.ndarray:
