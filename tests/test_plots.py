@@ -49,15 +49,19 @@ def texts(legend):
     return [text.get_text() for text in legend.get_texts()]
 
 
-def test_a_line_for_every_operating_point_told_apart_without_colour(figure):
-    for panel in figure.axes[:3]:
-        assert len(lines_of(panel)) == len(styles(panel)) == 6  # 3 gaps x 2 speeds
-    for panel in figure.axes[3:]:
-        assert len(lines_of(panel)) == len(styles(panel)) == 2  # a line per speed
-        assert texts(panel.get_legend()) == ["10 rpm", "20 rpm"]
-    [legend] = figure.legends
-    assert texts(legend) == [f"{gap} mm, {speed} rpm" for gap in (60, 40, 50) for speed in (10, 20)]
-    assert legend.get_title().get_text() == "gap, roll speed"
+def test_curves_are_told_apart_without_colour_and_alike_ones_drawn_once(figure):
+    """Speed changes the throughput alone: of 3 gaps x 2 speeds three products are apart."""
+    upper, lower = figure.axes[:3], figure.axes[3:]
+    for panel in upper[:2]:
+        assert len(lines_of(panel)) == len(styles(panel)) == 3
+    assert len(lines_of(upper[2])) == 4  # and the feed
+    assert [len(lines_of(panel)) for panel in lower] == [2] * 5
+    assert all(len(styles(panel)) == 2 for panel in lower)
+    assert [panel.get_title() for panel in lower[:2]] == ["throughput", "P80 (2 curves, 1 apart)"]
+    products, speeds = sorted(figure.legends, key=lambda legend: len(legend.get_texts()), reverse=True)
+    assert texts(products) == [f"{gap} mm, 10 rpm (and 1 alike)" for gap in (60, 40, 50)]
+    assert "swept: gap, roll speed" in products.get_title().get_text()
+    assert (speeds.get_title().get_text(), texts(speeds)) == ("roll speed", ["10 rpm", "20 rpm"])
 
 
 def test_labels_have_units(swept, figure):
@@ -67,37 +71,45 @@ def test_labels_have_units(swept, figure):
         assert panel.get_title()
     by_speed = draw(swept, "rolls.speed").axes[3:]
     assert {panel.get_xlabel() for panel in by_speed} == {"roll speed [rpm]"}
-    assert [panel.get_ylabel() for panel in by_speed] == ["throughput [t/h]", "P80 [mm]", "peak pressure [MPa]"]
+    wanted = ["throughput [t/h]", "P80 [mm]", "below 1 mm [%]", "W [kWh/t]", "peak pressure [MPa]"]
+    assert [panel.get_ylabel() for panel in by_speed] == wanted
 
 
-def test_fineness_is_mirrored_roll_to_roll(swept, figure):
+def test_fineness_is_drawn_where_it_was_measured(swept, figure):
     left, right = figure.axes[:2]
     points = report.operating_points(swept)
     passing = report.percent_passing(points, 1e-3, total=False).mean("replicate")
     for panel, values in ((left, points["p80"].mean("replicate") * 1e3), (right, passing)):
+        assert panel.get_xlim() == (0, 1)
         for k, line in enumerate(lines_of(panel)):
-            x, y = np.array(line.get_xdata(), float), np.array(line.get_ydata(), float)
-            assert np.array_equal(x, [*-swept["xi"].values[::-1], *swept["xi"].values])
-            assert np.array_equal(y, y[::-1])
-            assert y[3:] == pytest.approx(values.isel(operating_point=k).values, rel=1e-6)
-    assert right.get_ylabel() == "below 1 mm [%]"
+            assert line.get_xdata() == pytest.approx(swept["xi"].values)
+            expected = values.isel(operating_point=2 * k).transpose("streamline").values
+            assert line.get_ydata() == pytest.approx(expected, rel=1e-6)
+    flat = swept.copy(deep=True)
+    flat["p80"] = flat["p80"].mean("streamline") + 0 * flat["p80"]
+    written = [[text.get_text() for text in panel.texts] for panel in draw(flat).axes[:2]]
+    assert written[0] == ["flat within its noise"]
 
 
 def test_curves_hold_the_numbers(swept, figure):
     found = report.figures(swept, 1e-3)
-    for panel, heading in zip(figure.axes[3:], ["throughput [t/h]", "P80 [mm]", "peak pressure [MPa]"], strict=True):
+    for panel in figure.axes[3:]:
+        values = found[panel.get_ylabel()].isel(gap=[1, 2, 0])
         for k, (line, bars) in enumerate(zip(lines_of(panel), panel.containers, strict=True)):
+            if not len(line.get_xdata()):
+                continue  # coincides
             assert line.get_xdata() == pytest.approx([40, 50, 60])  # sorted, though swept as 60, 40, 50
-            values = found[heading].isel(roll_speed=k, gap=[1, 2, 0])
-            assert line.get_ydata() == pytest.approx(values.mean("replicate").values, rel=1e-12)
+            one = values.isel(roll_speed=k)
+            assert line.get_ydata() == pytest.approx(one.mean("replicate").values, rel=1e-12)
             low, high = np.array([each[:, 1] for each in bars.lines[2][0].get_segments()]).T
-            assert (high - low) / 2 == pytest.approx(report.spread(values).values, rel=1e-6, abs=1e-9)
-    panel = figure.axes[2]
-    means = report.operating_points(swept)["passing_total"].mean("replicate")
-    for k, line in enumerate(panel.lines):
-        percent = 100 * means.isel(operating_point=k).values
-        assert line.get_ydata() == pytest.approx(percent[percent > 0], rel=1e-6)
-        assert line.get_xdata() == pytest.approx(swept["sieve"].values[percent > 0] * 1e3, rel=1e-12)
+            assert (high - low) / 2 == pytest.approx(report.spread(one).values, rel=1e-6, abs=1e-9)
+    means = report.operating_points(swept)["passing_total"].astype(float).mean("replicate")
+    known = dict(zip(1e3 * swept["sieve"].values, 100 * means.isel(operating_point=0).values, strict=True))
+    first = figure.axes[2].lines[0]
+    assert first.get_ydata() == pytest.approx([known[size] for size in first.get_xdata()], rel=1e-6)
+    fed = figure.axes[2].lines[-1]
+    uniform = 100 * np.clip((fed.get_xdata() / 1e3 - 0.008) / 0.052, 0, 1)
+    assert fed.get_ydata() == pytest.approx(uniform)
 
 
 def test_caption_tells_replicates_and_remark(swept, figure):
@@ -113,7 +125,7 @@ def test_many_points_are_thinned_and_it_says_so():
     base = paper(BASE | {"resolution.cells": 20, "resolution.streamlines": 1})
     figure = draw(sweep(base, {"rolls.gap": np.linspace(0.03, 0.1, 11)}))
     assert "at most 7 of the operating points, evenly chosen" in figure.get_supxlabel()
-    for panel in figure.axes[:3]:
+    for panel in figure.axes[:2]:
         assert len(lines_of(panel)) == len(styles(panel)) == 7
     labels = texts(figure.legends[0])
     assert (labels[0], labels[-1]) == ("30 mm", "100 mm")
@@ -142,12 +154,12 @@ def test_stress_only_has_no_empty_panel_and_a_flat_curve_looks_flat():
     base = paper(BASE | {"resolution.cells": 0})
     speeds = [f"{rpm} rpm" for rpm in range(10, 19)]
     figure = draw(sweep(base, {"rolls.gap": [0.04, 0.05], "rolls.speed": speeds}), "rolls.speed")
-    assert [panel.get_ylabel() for panel in figure.axes] == ["throughput [t/h]", "peak pressure [MPa]"]
-    low, high = figure.axes[1].get_ylim()
-    assert np.ptp(lines_of(figure.axes[1])[0].get_ydata()) == 0  # speed does not change pressure
+    assert [panel.get_ylabel() for panel in figure.axes] == ["throughput [t/h]", "W [kWh/t]", "peak pressure [MPa]"]
+    low, high = figure.axes[2].get_ylim()
+    assert np.ptp(lines_of(figure.axes[2])[0].get_ydata()) == 0  # speed does not change pressure
     assert high - low > 0.3 * low
-    for panel in draw(sweep(base, {"rolls.gap": [0.04, 0.05], "rolls.speed": speeds})).axes:
-        assert len(styles(panel)) == len(lines_of(panel))  # more than seven lines of another axis are told apart
+    panel = draw(sweep(base, {"rolls.gap": [0.04, 0.05], "rolls.speed": speeds})).axes[0]
+    assert len(styles(panel)) == len(lines_of(panel)) == 7  # more than seven lines of another axis are thinned
 
 
 def test_lost_points_are_left_out(swept):
@@ -158,15 +170,10 @@ def test_lost_points_are_left_out(swept):
             result[name][{"gap": 0, "roll_speed": 0, "replicate": 0}] = np.nan
     result["status"][{"gap": 1, "roll_speed": 1}] = STATUS["failed"]
     figure = draw(result)
-    assert texts(figure.legends[0]) == [
-        "60 mm, 10 rpm",
-        "60 mm, 20 rpm",
-        "40 mm, 10 rpm",
-        "50 mm, 10 rpm",
-        "50 mm, 20 rpm",
-    ]
-    for panel in figure.axes[:3]:
-        assert len(lines_of(panel)) == 5
+    shown = max((texts(legend) for legend in figure.legends), key=len)
+    assert shown == ["60 mm, 10 rpm", "60 mm, 20 rpm", "40 mm, 10 rpm", "50 mm, 10 rpm (and 1 alike)"]
+    for panel in figure.axes[:2]:
+        assert len(lines_of(panel)) == 4
         assert all(np.isfinite(line.get_ydata()).all() for line in lines_of(panel))
     slow, fast = (line.get_ydata() for line in lines_of(figure.axes[4]))
     assert np.isnan(fast).tolist() == [True, False, False]  # 40, 50, 60 mm

@@ -172,7 +172,7 @@ def kpis(points: xr.Dataset, sieve: float) -> list[dict[str, Any]]:
     first = report.figures(points, sieve)
     known = {heading: (values.where(ok), "") for heading, values in first.items() if not heading.startswith("below ")}
     for name in of_dims(points, set(_CASE)):
-        if name not in ("status", "flags", *report.PRODUCT):
+        if name not in ("status", "flags", *report.FIGURES):
             known[heading_of(points[name])] = (shown(points, name), points[name].attrs.get("long_name", ""))
     return [
         {"heading": heading, "about": about} | entry(values.transpose(*_CASE))

@@ -13,24 +13,23 @@ from hpgr.results.schema import ERRORS, STATUS
 from studies.sweep.netcdf import scene_of
 from studies.sweep.space import SCENE
 
-PRODUCT = {  # variable -> heading, how many of its unit make one SI unit
+FIGURES = {  # variable -> heading, how many of its unit make one SI unit
+    "operating_gap": ("gap [mm]", 1e3),
     "throughput": ("throughput [t/h]", 3.6),
     "p50_total": ("P50 [mm]", 1e3),
     "p80_total": ("P80 [mm]", 1e3),
     "passing_total": ("below {} [%]", 100.0),
+    "specific_energy": ("W [kWh/t]", 1 / 3600),
     "peak_pressure": ("peak pressure [MPa]", 1e-6),
-}
-MACHINE = {
-    "operating_gap": ("gap [mm]", 1e3),
     "specific_pressing_force": ("Fsp [N/mm²]", 1e-6),
     "pressing_force": ("force [kN]", 1e-3),
-    "torque": ("torque [kN m]", 1e-3),
     "power": ("power [kW]", 1e-3),
-    "specific_energy": ("W [kWh/t]", 1 / 3600),
+    "torque": ("torque [kN m]", 1e-3),
     "specific_throughput": ("mdot [t s/(h m³)]", 3.6),
     "nip_angle": ("nip [deg]", 180 / np.pi),
     "force_angle": ("beta [deg]", 180 / np.pi),
 }
+_WIDEST, _LONGEST = 118, 26  # characters and rows of a table in the terminal
 
 
 def aligned(headings: Sequence[str], rows: Iterable[Sequence[str]], markdown: bool = False, words: int = 0) -> str:
@@ -112,19 +111,12 @@ def percent_passing(result: xr.Dataset, sieve: float, total: bool = True) -> xr.
 def figures(result: xr.Dataset, sieve: float) -> dict[str, xr.DataArray]:
     """Return the figures a study is read by, by heading, in the units people use."""
     found = {}
-    for name, (heading, factor) in PRODUCT.items():
+    for name, (heading, factor) in FIGURES.items():
         if name == "passing_total" and name in result:
             found[heading.format(show(sieve, "m"))] = percent_passing(result, sieve)
         elif name in result:
             found[heading] = result[name].astype(float) * factor
     return found
-
-
-def machine_figures(result: xr.Dataset) -> dict[str, xr.DataArray]:
-    """Return force, power and their like, by heading, in the units people use."""
-    return {
-        heading: result[name].astype(float) * factor for name, (heading, factor) in MACHINE.items() if name in result
-    }
 
 
 def spread(values: xr.DataArray) -> xr.DataArray:
@@ -136,36 +128,69 @@ def spread(values: xr.DataArray) -> xr.DataArray:
 
 
 def table(result: xr.Dataset, sieve: float) -> str:
-    """Return one line per operating point: axes, then mean ± standard deviation over the replicates."""
+    """Return the operating points as fit a screen: what varies in columns, axes first, what does not in a line."""
     if not any_result(result):
         return "no case holds a result"
     points = operating_points(result)
-    parts = [
-        points_table(result, points, found) for found in (figures(points, sieve), machine_figures(points)) if found
-    ]
-    if result.sizes["replicate"] > 1:
-        parts[-1] += f"\n(mean ± standard deviation of {result.sizes['replicate']} replicates)"
-    return "\n\n".join(parts)
+    return points_table(result, points, figures(points, sieve))
 
 
 def points_table(result: xr.Dataset, points: xr.Dataset, found: dict[str, xr.DataArray]) -> str:
-    """Return figures of operating points, by heading, as a table with the swept values before them."""
+    """Return figures of operating points, by heading, as `table` does; mean ± standard deviation over replicates."""
     along = (axis.name for dim in axes_of(result) for axis in swept(result, dim))
-    columns = {axis_label(points[name]): _axis_texts(points[name]) for name in along}
+    axes = {axis_label(points[name]): _axis_texts(points[name]) for name in along}
+    columns = {}
     for heading, values in found.items():
         means, spreads = values.mean("replicate").values, spread(values).values
         columns[heading] = [_mean_and_spread(*each) for each in zip(means, spreads, strict=True)]
-    return aligned(list(columns), zip(*columns.values(), strict=True))
+    count = points.sizes["operating_point"]
+    same = {name: texts[0] for name, texts in (axes | columns).items() if count > 1 and len(set(texts)) == 1}
+    axes, columns = ({name: each for name, each in part.items() if name not in same} for part in (axes, columns))
+    blocks = _blocks(axes, columns)
+    rows = np.linspace(0, count - 1, min(count, _LONGEST // len(blocks) - 2)).round().astype(int)
+    parts = [aligned(list(block), ([texts[k] for texts in block.values()] for k in rows)) for block in blocks]
+    told = [f"the same everywhere: {', '.join(f'{name} {text}' for name, text in same.items())}"] if same else []
+    if rows.size < count:
+        told.append(f"{rows.size} of {count} operating points, evenly chosen; the file has all, and --csv writes them")
+    if result.sizes["replicate"] > 1:
+        told.append(f"(mean ± standard deviation of {result.sizes['replicate']} replicates)")
+    return "\n".join(["\n\n".join(parts), *told])
+
+
+def _blocks(axes: dict[str, list[str]], columns: dict[str, list[str]]) -> list[dict[str, list[str]]]:
+    """Return the columns in tables that a screen is wide enough for, each after the axes."""
+    blocks, width = [dict(axes)], 0
+    for name, texts in columns.items():
+        width += 2 + max(map(len, (name, *texts)))
+        if width + sum(2 + max(map(len, (key, *each))) for key, each in axes.items()) > _WIDEST and len(
+            blocks[-1]
+        ) > len(axes):
+            blocks.append(dict(axes))
+            width = 2 + max(map(len, (name, *texts)))
+        blocks[-1][name] = texts
+    return blocks
+
+
+def csv_rows(result: xr.Dataset, sieve: float) -> list[list]:
+    """Return a heading and a row for every operating point: axes, replicates, mean and spread of every figure."""
+    points = operating_points(result)
+    along = [points[axis.name] for dim in axes_of(result) for axis in swept(result, dim)]
+    columns = {axis_label(axis): shown_values(axis) for axis in along}
+    columns["replicates"] = (points["status"] == STATUS["ok"]).sum("replicate").values
+    for heading, values in figures(points, sieve).items():
+        name, bracket, unit = heading.partition(" [")
+        columns |= {heading: values.mean("replicate").values, f"{name} sd{bracket}{unit}": spread(values).values}
+    return [list(columns), *zip(*(np.asarray(each).tolist() for each in columns.values()), strict=True)]
 
 
 def _mean_and_spread(mean: float, deviation: float) -> str:
     if np.isnan(mean):
         return "-"
-    return f"{mean:.4g}" + ("" if np.isnan(deviation) else f" ± {deviation:.2g}")
+    return f"{mean:.4g}" + (f" ± {deviation:.2g}" if deviation > 0 else "")
 
 
-def remarks(result: xr.Dataset) -> list[str]:
-    """Return a line for the scene's own remark, for estimated errors, and for each limit that was hit."""
+def remarks(result: xr.Dataset, every_flag: bool = False) -> list[str]:
+    """Return a line for the scene's own remark, for estimated errors, and for the limits that were hit."""
     own = scene_of(result).remark
     lines = [f"remark: {own}"] if own else []
     worst = {name: 100 * float(result[error].max()) for name, error in ERRORS.items() if error in result}
@@ -179,7 +204,18 @@ def remarks(result: xr.Dataset) -> list[str]:
         lines.append(
             f"exchange: {swaps:.3g} swaps of a cell in one residence time; at most {most} substeps a time step"
         )
-    return lines + flagged(result)
+    return lines + (flagged(result) if every_flag else flag_line(result))
+
+
+def flag_line(result: xr.Dataset) -> list[str]:
+    """Return one line on all limits that were hit, if any were."""
+    if "flags" not in result:
+        return []
+    points = operating_points(result)
+    hit = {name: int(((points["flags"] & bit) > 0).any("replicate").sum()) for name, bit in flags.BITS.items()}
+    told = ", ".join(f"{name.replace('_', ' ')} ({count})" for name, count in hit.items() if count)
+    total = points.sizes["operating_point"]
+    return [f"limits of the model that were hit, at how many of {total} operating points: {told}"] if told else []
 
 
 def flagged(result: xr.Dataset) -> list[str]:
@@ -213,8 +249,10 @@ def change(result: xr.Dataset, field: str) -> list[str]:
     count = int(ratio.notnull().sum())
     if not count:
         return []
-    error = f" ± {float(ratio.std(ddof=1)) / np.sqrt(count):.2g}" if count > 1 else ""
     ends = f"{_place(axis, order[0])} to {_place(axis, order[-1])}"
+    if (np.abs(ratio) < 1e-4).all():  # of a percent: rounding
+        return [f"P80 does not change from {ends}."]
+    error = f" ± {float(ratio.std(ddof=1)) / np.sqrt(count):.2g}" if count > 1 else ""
     told = " (mean ± standard error of pairs)" if error else ""
     return [f"P80 changes by {float(ratio.mean()):+.3g}{error} % from {ends}{told}."]
 
@@ -243,8 +281,8 @@ def any_result(result: xr.Dataset) -> bool:
 
 def axis_label(axis: xr.DataArray) -> str:
     """Return a swept coordinate's name with the unit it is shown in."""
-    name, unit = axis.name.replace("_", " "), axis.attrs.get("units", "1")
-    return name if unit == "1" else f"{name} [{unit_shown(unit)[0]}]"
+    name, unit = axis.name.replace("_", " "), _unit(axis)
+    return f"{name} [{unit}]" if unit else name
 
 
 def shown_values(axis: xr.DataArray) -> np.ndarray:
@@ -254,7 +292,16 @@ def shown_values(axis: xr.DataArray) -> np.ndarray:
 
 def value_text(axis: xr.DataArray, value) -> str:
     """Return a value of a swept coordinate as text with its unit."""
-    return show(float(value), axis.attrs.get("units", "1")) if axis.dtype.kind in "fiu" else str(value)
+    if axis.dtype.kind not in "fiu":
+        return str(value)
+    return f"{float(value) * unit_shown(axis.attrs.get('units', '1'))[1]:.6g} {_unit(axis)}".rstrip()
+
+
+def _unit(axis: xr.DataArray) -> str:
+    """Return the unit that a swept coordinate is shown in; a pressing force over an area is no stress."""
+    if axis.attrs.get("scene_field") == "rolls.specific_pressing_force":
+        return "N/mm²"
+    return unit_shown(axis.attrs.get("units", "1"))[0].removeprefix("1")
 
 
 def _place(axis: xr.DataArray, index: int) -> str:

@@ -33,7 +33,7 @@ def maps_figure(result: xr.Dataset, sieve: float, caption: str) -> Figure:
     caption : str
         Sentences under the figure.
     """
-    known = report.figures(result, sieve) | report.machine_figures(result)
+    known = report.figures(result, sieve)
     below = [heading for heading in known if heading.startswith("below")]
     headings = [name for name in (*below, "W [kWh/t]", "throughput [t/h]", "P80 [mm]") if name in known]
     across, up = (result[name] for name in report.axes_of(result))

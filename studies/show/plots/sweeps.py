@@ -15,6 +15,7 @@ from studies.show import report
 from studies.sweep.netcdf import scene_of
 
 _MOST_LINES = 7  # operating points a panel shows; more are thinned evenly, and the figure says so
+_SAME = 1e-6  # relative difference of curves that are drawn as one
 MARKERS = "os^Dv<>"
 _DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (7, 2)))
 
@@ -35,17 +36,20 @@ def sweep_figure(result: xr.Dataset, field: str, sieve: float, caption: str) -> 
     """
     along = (axis for dim in report.axes_of(result) for axis in report.swept(result, dim))
     axis = next(axis for axis in along if axis.attrs.get("scene_field") == field)
-    values = report.figures(result, sieve)
-    headings = [heading for heading in ("throughput [t/h]", "P80 [mm]", "peak pressure [MPa]") if heading in values]
-    sizes = "passing" in result
-    figure = Figure(figsize=(13, 8.6) if sizes else (9, 4.5), layout="constrained")
-    panels = figure.subplots(2 if sizes else 1, len(headings), squeeze=False)
-    thinned = False
-    if sizes:
-        thinned = fineness_across_gap(panels[0, 0], panels[0, 1], result, sieve)
-        product_sizes(panels[0, 2], result)
-    for panel, heading in zip(panels[-1], headings, strict=True):
-        thinned |= against_axis(panel, values[heading], axis, heading)
+    known, below = report.figures(result, sieve), f"below {show(sieve, 'm')} [%]"
+    wanted = ("throughput [t/h]", "P80 [mm]", below, "W [kWh/t]", "peak pressure [MPa]")
+    headings, sizes = [heading for heading in wanted if heading in known], "passing" in result
+    figure = Figure(figsize=(17, 9.2) if sizes else (12, 4.8), layout="constrained")
+    panels = figure.subplots(2 if sizes else 1, 4 if sizes else len(headings), squeeze=False).ravel()
+    thinned = _products(panels[:3], result, sieve) if sizes else False
+    for panel, heading in zip(panels[3 * sizes :], headings, strict=True):
+        thinned |= against_axis(panel, known[heading], axis, heading)
+    handles, names = panels[-1].get_legend_handles_labels()
+    if names:
+        others = [name for name in report.axes_of(result) if name not in axis.dims]
+        figure.legend(handles, names, title=_joined(others), loc="outside right lower", fontsize=9)
+    if not sizes:
+        figure.suptitle(_title(result), fontsize=11)
     words = [caption] if caption else []
     if thinned:
         words.append(f"Panels show at most {_MOST_LINES} of the operating points, evenly chosen.")
@@ -55,9 +59,22 @@ def sweep_figure(result: xr.Dataset, field: str, sieve: float, caption: str) -> 
     return figure
 
 
+def _title(result: xr.Dataset) -> str:
+    """Return machine, ore and what is swept."""
+    scene, swept = scene_of(result), _joined(report.axes_of(result)) or "nothing"
+    rolls, ore, feed = scene.rolls, scene.strength, scene.feed
+    strength = (
+        f"{show(ore.reference_strength, 'Pa', 3)} at {show(ore.reference_size, 'm')}, w {ore.weibull_modulus:.3g}"
+    )
+    return (
+        f"Rolls {show(rolls.diameter, 'm')} x {show(rolls.width, 'm')}; ore of {strength}; "
+        f"{feed.kind.replace('_', ' ')} feed to {show(feed.largest_grain, 'm')}; swept: {swept}"
+    )
+
+
 def caption_under(figure: Figure, result: xr.Dataset, words: str) -> None:
     """Write under a figure its own words, the limits that were hit, and the remark of the scene."""
-    lines = [words, *(line[0].upper() + line[1:] + "." for line in report.flagged(result))]
+    lines = [words, *(line[0].upper() + line[1:] + "." for line in report.flag_line(result))]
     remark = scene_of(result).remark
     lines += [f"Scene: {remark}."] if remark else []
     width = int(14 * figure.get_figwidth())  # letters
@@ -65,45 +82,61 @@ def caption_under(figure: Figure, result: xr.Dataset, words: str) -> None:
     figure.supxlabel("\n".join(folded), fontsize=9)
 
 
-def fineness_across_gap(left, right, result: xr.Dataset, sieve: float) -> bool:
-    """Draw P80 and percent passing against position, roll to roll; return whether points were left out."""
+def _products(panels, result: xr.Dataset, sieve: float) -> bool:
+    """Draw the product across half the gap and by size; return whether operating points were left out."""
     points, labels, thinned = _shown_points(result)
     passing = report.percent_passing(points, sieve, total=False)
-    for k, label in enumerate(labels):
-        style = _style(k, len(labels))
-        for panel, values in ((left, points["p80"] * 1e3), (right, passing)):
-            one = values.isel(operating_point=k)
-            position, mean = _mirrored(result["xi"].values, one.mean("replicate").values)
-            _, bars = _mirrored(result["xi"].values, report.spread(one).values)
-            panel.errorbar(position, mean, None if np.isnan(bars).all() else bars, label=label, **style)
-    left.set(ylabel="P80 [mm]", title="Product size across the gap")
-    right.set(ylabel=f"below {show(sieve, 'm')} [%]", title="Fineness across the gap")
-    for panel in (left, right):
-        panel.set_xlabel("position across the gap, roll to roll [half gaps]")
-        panel.set_xlim(-1, 1)
-        panel.set_xticks([-1, -0.5, 0, 0.5, 1])
-        for roll in (-1, 1):
-            panel.axvline(roll, color="0.3", linewidth=2)
-        panel.grid(color="0.9")
-    handles, names = left.get_legend_handles_labels()
-    title = _joined(report.axes_of(result))
-    left.figure.legend(handles, names, title=title, loc="outside upper center", ncols=len(names), fontsize=9)
+    values = xr.Dataset({"p80": points["p80"].astype(float) * 1e3, "passing": passing})
+    across = values.transpose("operating_point", "replicate", "streamline")
+    groups = _alike(np.concatenate([each.values.reshape(len(labels), -1) for each in across.values()], axis=1))
+    chosen = [group[0] for group in groups]
+    named = [labels[group[0]] + (f" (and {len(group) - 1} alike)" if len(group) > 1 else "") for group in groups]
+    for panel, (name, title, unit) in zip(
+        panels,
+        (("p80", "Product size", "P80 [mm]"), ("passing", "Fineness", f"below {show(sieve, 'm')} [%]")),
+        strict=False,
+    ):
+        _across_half_gap(panel, across[name].isel(operating_point=chosen), result["xi"].values, named)
+        panel.set(title=f"{title} from mid-gap to the roll", ylabel=unit)
+    handles, names = panels[0].get_legend_handles_labels()
+    place = {"loc": "outside upper center", "ncols": len(names), "fontsize": 9, "frameon": False}
+    panels[0].figure.legend(handles, names, title=_title(result), **place)
+    _product_sizes(panels[2], points.isel(operating_point=chosen), scene_of(result).feed)
     return thinned
 
 
-def product_sizes(panel, result: xr.Dataset) -> None:
-    """Draw the cumulative size distributions of the whole product on log axes."""
-    points, labels, _ = _shown_points(result)
-    sieves = result["sieve"].values * 1e3
+def _across_half_gap(panel, values: xr.DataArray, xi: np.ndarray, labels: list[str]) -> None:
+    """Draw a figure of every stream tube where it was measured, and say if it is flat within its noise."""
+    flat = True
     for k, label in enumerate(labels):
-        percent = 100 * points["passing_total"].isel(operating_point=k).mean("replicate").values
-        seen = percent > 0
-        panel.plot(sieves[seen], percent[seen], label=label, **_style(k, len(labels)) | {"markevery": (k, 7)})
+        one = values.isel(operating_point=k)
+        mean, bars = one.mean("replicate").values, report.spread(one).values
+        known = not np.isnan(bars).all()
+        panel.errorbar(xi, mean, bars if known else None, label=label, **_style(k, len(labels)))
+        flat &= known and bool((np.abs(mean - mean.mean()) <= 2 * bars.max() / np.sqrt(one.sizes["replicate"])).all())
+    if flat:
+        panel.text(0.5, 0.03, "flat within its noise", ha="center", transform=panel.transAxes, fontsize=9)
+    panel.set(xlabel="distance from mid-gap [half gaps]", xlim=(0, 1))
+    panel.axvline(1, color="0.3", linewidth=3)  # the roll
+    panel.grid(color="0.9")
+
+
+def _product_sizes(panel, points: xr.Dataset, feed) -> None:
+    """Draw the size distributions of the whole product at the recorded sieves, and that of the feed, on log axes."""
+    sieves, count = points["sieve"].values, points.sizes["operating_point"]
+    passing = 100 * points["passing_total"].astype(float).mean("replicate").transpose("operating_point", "sieve").values
+    fed = 100 * feed.passing(sieves)
+    for k, percent in enumerate(passing):
+        seen = (percent > 0) & (np.cumsum(percent >= 100) <= 1)  # beyond the first that all passes nothing is told
+        panel.plot(1e3 * sieves[seen], percent[seen], **_style(k, count) | {"markersize": 3})
+    seen = (fed > 0) & (np.cumsum(fed >= 100) <= 1)
+    panel.plot(1e3 * sieves[seen], fed[seen], color="0.6", linewidth=3, alpha=0.7, zorder=0)
+    middle = np.flatnonzero(seen)[seen.sum() // 2]
+    panel.annotate("feed of the scene", (1e3 * sieves[middle], fed[middle]), color="0.4", fontsize=9, ha="right")
     panel.set(xscale="log", yscale="log", xlabel="sieve [mm]", ylabel="passing [%]", title="Product of the whole gap")
     panel.set_ylim(0.1, 130)
-    across = [name for name in points["passing_total"].dims if name != "sieve"]
-    finest, coarsest = points["passing_total"].max(across).values, points["passing_total"].min(across).values
-    panel.set_xlim(sieves[np.argmax(finest > 1e-3)], sieves[np.argmax(coarsest > 0.999)] * 1.3)
+    low = sieves[np.argmax(passing.max(axis=0) > 0.1)]
+    panel.set_xlim(1e3 * low, 1.3e3 * feed.largest_grain)
     panel.grid(color="0.9", which="both")
 
 
@@ -112,29 +145,45 @@ def against_axis(panel, values: xr.DataArray, axis: xr.DataArray, heading: str) 
     [dim] = axis.dims
     others = [name for name in values.dims if name not in (dim, "replicate")]
     lines = values.stack(line=others, create_index=False) if others else values.expand_dims("line")
-    shown = report.shown_values(axis)
-    numeric = axis.dtype.kind in "fiu"
-    order = np.argsort(shown) if numeric else np.arange(shown.size)
-    total = lines.sizes["line"]
+    lines = lines.transpose("line", dim, "replicate")
+    shown, total = report.shown_values(axis), lines.sizes["line"]
+    order = np.argsort(shown) if axis.dtype.kind in "fiu" else np.arange(shown.size)
     lines = lines.isel(line=_thinned(np.arange(total)))
-    for k in range(lines.sizes["line"]):
-        one = lines.isel(line=k).transpose(dim, "replicate")
-        bars = report.spread(one).values
-        label = ", ".join(report.value_text(values[name], lines[name].values[k]) for name in others)
-        style = _style(k, lines.sizes["line"]) | {"color": str(0.6 * k / max(lines.sizes["line"] - 1, 1))}
+    groups, count = _alike(lines.values.reshape(lines.sizes["line"], -1)), lines.sizes["line"]
+    for k in range(count):
+        one = lines.isel(line=k)
+        bars, label = report.spread(one).values, _line_name(values, lines, others, k)
+        style = _style(k, count) | {"color": str(0.6 * k / max(count - 1, 1))}
         style |= {} if dim == axis.name else {"linestyle": "none"}  # other fields vary along it too
         error = None if np.isnan(bars).all() else bars[order]
-        panel.errorbar(shown[order], one.mean("replicate").values[order], error, label=label or None, **style)
-    panel.set(xlabel=report.axis_label(axis), ylabel=heading, title=heading.partition(" [")[0])
+        if k in [group[0] for group in groups]:
+            panel.errorbar(shown[order], one.mean("replicate").values[order], error, label=label or None, **style)
+        else:  # in the legend alone: what it coincides with is drawn
+            panel.errorbar([], [], [], label=label, **style)
+    alike = f" ({count} curves, {len(groups)} apart)" if len(groups) < count else ""
+    panel.set(xlabel=report.axis_label(axis), ylabel=heading, title=heading.partition(" [")[0] + alike)
     if values.max() > 0:
         low, high = panel.get_ylim()
         if low > 0 and low > 0.8 * high:  # a flat curve must look flat
             panel.set_ylim(0.8 * low, 1.2 * high)
     panel.ticklabel_format(axis="y", useOffset=False)
     panel.grid(color="0.9")
-    if others:
-        panel.legend(fontsize=8, title=_joined(others))
-    return lines.sizes["line"] < total
+    return count < total
+
+
+def _line_name(values: xr.DataArray, lines: xr.DataArray, others: list[str], k: int) -> str:
+    return ", ".join(report.value_text(values[name], lines[name].values[k]) for name in others)
+
+
+def _alike(rows: np.ndarray) -> list[list[int]]:
+    """Return the numbers of rows in groups that are the same but for rounding."""
+    groups: list[list[int]] = []
+    for k, row in enumerate(rows):
+        scale = _SAME * np.nanmax(np.abs(row), initial=0.0)
+        same = (group for group in groups if np.allclose(rows[group[0]], row, rtol=0, atol=scale, equal_nan=True))
+        group = next(same, None)
+        groups.append([k]) if group is None else group.append(k)
+    return groups
 
 
 def _shown_points(result: xr.Dataset) -> tuple[xr.Dataset, list[str], bool]:
@@ -159,11 +208,6 @@ def _thinned(numbers: np.ndarray) -> np.ndarray:
 
 def _joined(names: list[str]) -> str:
     return ", ".join(name.replace("_", " ") for name in names)
-
-
-def _mirrored(xi: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and values of both halves of the gap, from roll to roll."""
-    return np.concatenate([-xi[::-1], xi]), np.concatenate([values[::-1], values])
 
 
 def _style(k: int, count: int) -> dict:
