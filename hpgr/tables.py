@@ -64,17 +64,18 @@ def read_sieve_table(path: str | Path) -> list[tuple[float, float]]:
     (0.045, 100.0)
     """
     (head, header), *body = _lines(path)
-    try:
-        at, unit = _size_column(header)
-        of = _value_column(header)
-    except ValueError as error:
-        raise ValueError(f"{path}: line {head}, header {_short(','.join(header))}: {error}; {_FORMAT}") from None
-    found = []
+    at = next((k for k, name in enumerate(header) if _SIZE_HEADER.search(name)), None)
+    words = [(word, k) for word in ("pass", "finer", "retain") for k, name in enumerate(header) if word in name.lower()]
+    if at is None or not words:
+        lacks = "column of sizes" if at is None else "percent passing or retained"
+        raise ValueError(f"{path}: line {head}, header {_short(','.join(header))}: it names no {lacks}; {_FORMAT}")
+    unit, of, found = re.findall(r'[a-zµμ]+|"', header[at].lower())[-1], words[0][1], []
     for line, cells in body:
         try:
             if len(cells) != len(header):
                 raise ValueError(f"got {len(cells)} cells, the header has {len(header)}; {_DECIMALS}")
-            found.append(_sieve(line, cells, at, of, unit))
+            size = 0.0 if cells[at].lower() == "pan" else _metres(cells[at], _UNITS.get(unit, unit))
+            found.append(_Row(line, "", {"size": size, "passing": _number(cells[of])}))
         except (ValueError, ArithmeticError) as error:
             raise ValueError(f"{path}: line {line} {_short(','.join(cells))}: {error}; {_FORMAT}") from None
     rows = _passing(found, header[of].lower())
@@ -85,55 +86,19 @@ def read_sieve_table(path: str | Path) -> list[tuple[float, float]]:
     return table if table[-1][1] == 100 else [*table, (_next_sieve(path, rows, "size", 1e3), 100.0)]
 
 
-def _size_column(header: list[str]) -> tuple[int, str]:
-    """Return where the sizes stand and the unit that the header gives them, empty if it gives none."""
-    at = next((k for k, name in enumerate(header) if _SIZE_HEADER.search(name)), None)
-    if at is None:
-        raise ValueError("it names no column of sizes")
-    *before, last = re.findall(r'[a-zµμ]+|"', header[at].lower())
-    unit = _UNITS.get(last, last)
-    if unit != "mesh" and (not before or _SIZE_HEADER.fullmatch(unit)):
-        return at, ""
-    _metres_per(unit)
-    return at, unit
-
-
-def _value_column(header: list[str]) -> int:
-    found = [k for word in ("pass", "finer", "retain") for k, name in enumerate(header) if word in name.lower()]
-    if not found:
-        raise ValueError("it names no percent passing or retained")
-    return found[0]
-
-
-def _metres_per(unit: str) -> float:
-    try:
-        return 1e-3 if unit == "mesh" else parse(f"1 {unit}", "m")
-    except ValueError as error:
-        raise ValueError(f"{error}; give the sizes in a length such as mm") from None
-
-
-def _sieve(line: int, cells: list[str], at: int, of: int, unit: str) -> "_Row":
-    """Return the row; a pan has the size 0."""
-    size = 0.0 if cells[at].lower() == "pan" else _metres(cells[at], unit)
-    return _Row(line, "", {"size": size, "passing": _number(cells[of])})
-
-
 def _metres(text: str, unit: str) -> float:
     """Return a size in m: a number, a fraction of an inch or a mesh number, with its own unit or the header's."""
     found = _SIZE.fullmatch(text)
     if not found:
         raise ValueError("its size must be a number, a fraction of an inch or a mesh number")
     own = _UNITS.get(found[2].lower(), found[2]) or ("mesh" if text.startswith("#") else unit)
-    if not own:
-        raise ValueError("name the unit of the sizes in the header")
     if own == "mesh" and found[1] not in _MESH:
         raise ValueError(f"its size must be a mesh number of ASTM E11: {', '.join(_MESH)}")
-    number = _MESH[found[1]] if own == "mesh" else sum(map(_part, found[1].split()))
-    return number * _metres_per(own)
-
-
-def _part(text: str) -> float:
-    return float(Fraction(text)) if "/" in text else float(text)
+    if _SIZE_HEADER.fullmatch(own) and own != "mesh":
+        raise ValueError("name the unit of the sizes in the header")
+    if own == "mesh":
+        return _MESH[found[1]] * 1e-3
+    return sum(float(Fraction(part)) for part in found[1].split()) * parse(f"1 {own}", "m")
 
 
 def _passing(rows: list["_Row"], name: str) -> list["_Row"]:

@@ -48,7 +48,7 @@ def test_next_sieve_is_added_above_up_to_5_percent_and_said(tmp_path):
         ("size,percent_passing\n1,2\n", "line 2 '1,2': name the unit of the sizes"),
         ("1,2\n3,4\n", "line 1, header '1,2': it names no column of sizes"),
         ("size_mm,percent\n1,2\n", "it names no percent passing or retained"),
-        ("size_kg,percent_passing\n1,2\n", "'kg' measures something else; give the sizes in a length"),
+        ("size_kg,percent_passing\n1,2\n", "line 2 '1,2': not a quantity in mm: its unit 'kg' measures something else"),
         ("size_foo,percent_passing\n1,2\n", "'foo' is not known"),
         ("size_mm,percent_passing\n1,10\nx,100\n", "line 3 'x,100': its size must be a number, a fraction"),
         ("size_mm,percent_passing\n1,10\n2,\n", "line 3 '2,': must be a number"),
