@@ -200,10 +200,10 @@ class Report(NamedTuple):
     faults: Sequence[str] = ()
 
 
-def file_of(out: Path, suffix: str = ".nc") -> Path:
-    """Return the path that `--out` asks for, with its suffix."""
+def file_of(out: Path, suffix: str = ".nc", option: str = "--out") -> Path:
+    """Return the path that an option asks for, with its suffix."""
     if out.name in ("", ".."):
-        raise ValueError(f"--out: got {str(out)!r}; must be the name of a file; such as --out outputs/mine{suffix}")
+        raise ValueError(f"{option}: got {str(out)!r}; must be the name of a file; such as outputs/mine{suffix}")
     return out if out.suffix == suffix else out.with_name(out.name + suffix)
 
 

@@ -1,5 +1,6 @@
 """The command lines of the sweeps, and what all studies share: options, files, refusals, exit codes."""
 
+import csv
 import re
 import subprocess
 import sys
@@ -82,28 +83,29 @@ def python(*arguments):
 # ---- what a sweep does
 
 
-@pytest.mark.parametrize("name", STUDIES)
-def test_defaults(run, folder, name):
-    code, out, err = run(study=STUDIES[name])
+@pytest.mark.parametrize(
+    ("name", "axis", "own"),
+    [("gap_sweep", "gap", 0.06), ("speed_sweep", "roll_speed", 19 * np.pi / 30), ("feed_sweep", "feed_top_size", 0.06)],
+)
+def test_defaults(run, folder, name, axis, own):
+    plot = ["--no-plot"] * (name != "gap_sweep")
+    code, out, err = run(*plot, study=STUDIES[name])
     assert code == 0, err
-    assert files(folder) == [f"outputs/{name}.nc", f"outputs/{name}.png"]
-    assert (folder / "outputs" / f"{name}.cases" / "lock").is_file()
-    assert (folder / "outputs" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-    assert f"wrote outputs/{name}.nc and outputs/{name}.png" in out
+    if plot:
+        assert files(folder) == [f"outputs/{name}.nc"]
+    else:
+        assert files(folder) == [f"outputs/{name}.nc", f"outputs/{name}.png"]
+        assert (folder / "outputs" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert f"wrote outputs/{name}.nc and outputs/{name}.png" in out
     assert STUDIES[name].STUDY.caption in out
     result = opened(f"outputs/{name}.nc")
-    axis, own = {
-        "gap_sweep": ("gap", 0.06),
-        "speed_sweep": ("roll_speed", 19 * np.pi / 30),
-        "feed_sweep": ("feed_top_size", 0.06),
-    }[name]
     assert result["p80_total"].dims == (axis, "replicate")
     assert result.sizes["replicate"] == 3
     assert result[axis].size >= 4
     assert (np.diff(result[axis]) > 0).all()
     assert np.isclose(result[axis], own, rtol=1e-3).sum() == 1  # the scene itself is one of the points
     assert (result["status"] == 0).all()
-    assert result.attrs["history"] == f"python -m studies.{name} {' '.join(SMALL)}"
+    assert result.attrs["history"] == " ".join([f"python -m studies.{name}", *SMALL, *plot])
     if name == "speed_sweep":
         assert "speed changes throughput and nothing else" in out
 
@@ -123,26 +125,34 @@ def test_further_axes_come_after_the_study_s_own(run):
     assert "±" not in out
 
 
-def test_table_agrees_with_the_file(run):
-    _, out, _ = run("--gap", "40 mm", "60 mm", "--sieve", "2 mm", "--no-plot")
+def test_table_and_csv_agree_with_the_file(run):
+    code, out, _ = run("--gap", "40 mm", "60 mm", "--sieve", "2 mm", "--no-plot", "--csv", "table")
+    assert code == 0
+    assert "wrote outputs/gap_sweep.nc and table.csv" in out
     heading, *rows = [re.split(r"\s{2,}", line.strip()) for line in out.splitlines()[:3]]
-    named = ["gap [mm]", "throughput [t/h]", "P50 [mm]", "P80 [mm]", "below 2 mm [%]", "peak pressure [MPa]"]
-    assert heading == named
-    result = opened("outputs/gap_sweep.nc")
+    shown = dict(zip(heading, zip(*rows, strict=True), strict=True))
+    with open("table.csv", encoding="utf-8-sig", newline="") as file:
+        plant = list(csv.DictReader(file))
+    result = opened("outputs/gap_sweep.nc").astype(float)
+    assert [float(gap) for gap in shown["gap [mm]"]] == pytest.approx(1e3 * result["gap"].values)
+    assert [float(row["gap [mm]"]) for row in plant] == pytest.approx(1e3 * result["gap"].values)
     logs = np.log(result["sieve"].values)
-    for k, (gap, *shown) in enumerate(rows):
-        case = result.isel(gap=k)
-        assert float(gap) == pytest.approx(float(case["gap"]) * 1e3)
-        below = [100 * np.interp(np.log(2e-3), logs, one) for one in case["passing_total"].values]
-        columns = [case["throughput"] * 3.6, case["p50_total"] * 1e3, case["p80_total"] * 1e3, below]
-        columns.append(case["peak_pressure"] / 1e6)
-        for text, values in zip(shown, columns, strict=True):
-            mean, spread = map(float, text.split(" ± "))
-            values = np.asarray(values, float)
-            assert mean == pytest.approx(values.mean(), rel=6e-4)  # 4 digits are shown
-            assert spread == pytest.approx(values.std(ddof=1), rel=0.06, abs=1e-12 * mean)  # 2 digits
-    assert all(float(row[1].split(" ± ")[1]) == 0 for row in rows)  # throughput knows no chance
-    assert all(float(row[3].split(" ± ")[1]) > 0 for row in rows)
+    below = [[100 * np.interp(np.log(2e-3), logs, one) for one in case] for case in result["passing_total"].values]
+    figures = {
+        "throughput [t/h]": result["throughput"] * 3.6,
+        "P80 [mm]": result["p80_total"] * 1e3,
+        "below 2 mm [%]": below,
+        "peak pressure [MPa]": result["peak_pressure"] / 1e6,
+    }
+    for name, values in figures.items():
+        means, spreads = (np.asarray(each) for each in (np.mean(values, axis=1), np.std(values, axis=1, ddof=1)))
+        assert [float(row[name]) for row in plant] == pytest.approx(means)
+        for text, mean, spread in zip(shown[name], means, spreads, strict=True):
+            assert float(text.partition(" ± ")[0]) == pytest.approx(mean, rel=6e-4)  # 4 digits are shown
+            told = float(text.partition(" ± ")[2] or 0)
+            assert told == pytest.approx(spread, rel=0.06, abs=1e-12 * mean)  # 2 digits
+    assert "±" not in "".join(shown["throughput [t/h]"])  # it knows no chance
+    assert all("±" in text for text in shown["P80 [mm]"])
     assert "(mean ± standard deviation of 3 replicates)" in out
 
 
@@ -255,7 +265,7 @@ def test_lost_cases_are_named_and_exit_code_is_1(run, folder, monkeypatch):
     assert "entry gap 1140 mm" in line
     # nothing in a message steers the terminal
     assert r"failed: gap 50 mm, 1 of 3 replicates: RuntimeError: boom \x1b[2J" in err
-    assert re.search(r"^\s+1200(\s+-){5}$", out, re.MULTILINE)
+    assert re.search(r"^\s+1200(\s+-)+$", out, re.MULTILINE)
     assert files(folder) == ["outputs/gap_sweep.nc", "outputs/gap_sweep.png"]
 
 
@@ -279,9 +289,8 @@ def test_gap_floats_under_a_swept_pressing_force(run):
     assert result["specific_pressing_force"].values == pytest.approx([3e6, 4.5e6], rel=1e-6)
     gaps = result["operating_gap"].values
     assert 0.02 < gaps[1] < gaps[0] < 0.1
-    heading = next(line for line in out.splitlines() if "Fsp" in line)
     for figure in ("gap [mm]", "Fsp [N/mm²]", "power [kW]", "W [kWh/t]", "torque [kN m]", "beta [deg]"):
-        assert figure in heading
+        assert figure in out
 
 
 # ---- what is refused
@@ -405,8 +414,8 @@ def test_out_that_cannot_be_written(refused, folder):
 
 
 def test_earlier_result_of_the_same_study_is_extended(run):
-    assert run(*GAP)[0] == 0
-    assert run("--gap", "40 mm", "50 mm", "--replicates", "1")[0] == 0
+    assert run(*GAP, "--no-plot")[0] == 0
+    assert run("--gap", "40 mm", "50 mm", "--replicates", "1", "--no-plot")[0] == 0
     assert opened("outputs/gap_sweep.nc").sizes["gap"] == 2
 
 
@@ -461,6 +470,7 @@ def test_main_writes_what_a_study_reports(folder, capsys):
     assert main(["--overwrite"]) == 0
 
 
+@pytest.mark.slow
 def test_module_runs_as_a_command(folder, monkeypatch):
     # without the compiler NumPy speaks up when a 64-bit stream wraps, which is what it is there for
     monkeypatch.setenv("PYTHONWARNINGS", "ignore:overflow encountered in scalar:RuntimeWarning")

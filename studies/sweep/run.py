@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from pydantic import ValidationError
 from hpgr import cost
 from hpgr.bed.loaded import Beds
 from hpgr.fields import faults_of
+from hpgr.grains import kernels
 from hpgr.results import schema
 from hpgr.run import Result, attributes, run_scene
 from hpgr.tolerance import refine
@@ -220,6 +222,8 @@ def _computed(plan: Plan, client: Any, task: Task, progress: bool) -> Iterator[C
     total = plan.space.total
     if progress:
         say(_prediction(plan, workers))
+        if _to_compile():
+            say("the first run compiles the model, which takes about a minute, once")
     with progress_bar(total, progress, "cases", "{rate_fmt}, {remaining} left", total - plan.left) as bar:
         for result in dispatched(plan, client, task):
             yield result
@@ -233,6 +237,12 @@ def _batch_size(plan: Plan, workers: int) -> int:
         return plan.space.replicates
     quick = int(_BATCH_SECONDS / cost.predict(plan.spec.base).seconds)
     return max(1, min(_BATCH, quick, plan.left // (4 * workers)))
+
+
+def _to_compile() -> bool:
+    """Return whether the compiler has left nothing on disk yet that a run could load."""
+    stats = getattr(kernels.march, "stats", None)  # which plain Python has not
+    return stats is not None and not list(Path(stats.cache_path).glob("kernels.march*.nbi"))
 
 
 def _prediction(plan: Plan, workers: int) -> str:

@@ -69,6 +69,10 @@ class Options:
     out: Annotated[Path | None, shown_as("FILE")] = None
     """NetCDF file to write (default: outputs/<study>.nc); beside it the figure, .png, and finished cases, .cases."""
     plot: line.Plot = True
+    csv: Annotated[Path | None, shown_as("FILE")] = None
+    """Write one row per operating point in plant units, too, for a spreadsheet."""
+    flags: line.Flag = False
+    """Describe every limit that operating points have hit."""
     overwrite: line.Overwrite = False
     dry_run: line.Flag = False
     """List the cases with their predicted memory and time, say which are finished already, and run none."""
@@ -79,7 +83,8 @@ def sweep_command(study: Study) -> Callable[..., int]:
 
     def files(options: Options) -> list[Path]:
         out = _out(study, options)
-        return [] if options.dry_run else [out, out.with_suffix(".png")][: 1 + options.plot]
+        extra = [] if options.csv is None else [line.file_of(options.csv, ".csv", "--csv")]
+        return [] if options.dry_run else [out, *[out.with_suffix(".png")] * options.plot, *extra]
 
     @line.command(study.name, study.about, files)
     def main(options: Options) -> Report:
@@ -111,7 +116,7 @@ def _run(study: Study, options: Options) -> Report:
     fields = Space(axes).fields
     main = AXES[study.main] if AXES[study.main] in fields else fields[0]
     caption = caption if main == AXES[study.main] else ""
-    return _report(main, caption, _swept(scene, space, options, folder), sieve)
+    return _report(main, caption, _swept(scene, space, options, folder), sieve, options)
 
 
 def _check(options: Options) -> None:
@@ -199,16 +204,25 @@ def _swept(scene: Scene, space: dict[Any, Any], options: Options, folder: Path) 
         return sweep(scene, space, client=client, **common)
 
 
-def _report(field: str, caption: str, result: "xr.Dataset", sieve: float) -> Report:
+def _report(field: str, caption: str, result: "xr.Dataset", sieve: float, options: Options) -> Report:
     from studies.show import plant, report
 
     lost = report.lost_cases(result)
     if not report.any_result(result):
         return Report(faults=[*lost, "no case holds a result; nothing was written"])
     sayings = [*report.change(result, field), caption]
-    lines = [report.table(result, sieve), *report.remarks(result), *sayings]
+    lines = [report.table(result, sieve), *report.remarks(result, options.flags), *sayings]
     drawn = line.figure(lambda: plant.picture(result, field, sieve, "\n".join(sayings)))
-    return Report(lines, [result, drawn], lost)
+    return Report(lines, [result, *[drawn] * options.plot, lambda path, _: _write_csv(path, result, sieve)], lost)
+
+
+def _write_csv(path: Path, result: "xr.Dataset", sieve: float) -> None:
+    import csv
+
+    from studies.show import report
+
+    with path.open("w", encoding="utf-8-sig", newline="") as file:  # with the mark by which spreadsheets know UTF-8
+        csv.writer(file).writerows(report.csv_rows(result, sieve))
 
 
 def _headings(dim: str, axis: Axis) -> list[str]:
