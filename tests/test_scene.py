@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from support import paper
 
 from hpgr import Resolution, Rolls, Scene, presets
-from hpgr.fields import parts_of
+from hpgr.fields import kinds_of, parts_of
 from hpgr.scene import field_info, field_value, levels
 
 INF = math.inf
@@ -31,11 +31,16 @@ FLOATS = [
 ]
 # where inf is a limit with a meaning
 MAY_BE_INF = {name for name in FLOATS if any(getattr(one, "allow_inf_nan", False) for one in FIELDS[name].metadata)}
+# fields that the law meant by default has not, with the kind of one that has them
+DEFAULTS = {"feed": "uniform", "flow": "power", "roll_width": "parabola"}
 OWN_KIND = {
-    "feed.size": "single",
-    "feed.exponent": "power_law",
-    "flow.nip_angle": "nip",
-    "flow.cake_solid_fraction": "nip",
+    f"{section}.{key}": kinds_of(law)[0]
+    for section, default in DEFAULTS.items()
+    for law in reversed(parts_of(Scene.model_fields[section]))
+    for key in law.model_fields
+    if not any(
+        key in other.model_fields for other in parts_of(Scene.model_fields[section]) if default in kinds_of(other)
+    )
 }
 
 
