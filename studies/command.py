@@ -81,18 +81,8 @@ Overwrite = Annotated[Flag, shown_as("", "Replace files that are not this comman
 def base_scene(options: Any, **resolution: Any) -> Scene:
     """Return the scene of a preset or file, with the resolution and exchange that are asked for.
 
-    Parameters
-    ----------
-    options : str or object
-        Name of the scene; or options that have it as `scene`, and may have level, cells, points, streamlines and
-        exchange.
-    **resolution
-        Other values of `Scene.resolution`, or a `level`; None leaves the scene's.
-
-    Raises
-    ------
-    ValueError
-        If there is no such scene, or it is impossible.
+    `options` is its name, or has it as `scene` and may have level, cells, points, streamlines and exchange; further
+    values of `Scene.resolution` by name, of which None leaves the scene's. ValueError if there is no such scene.
     """
     given = {name: getattr(options, name, None) for name in ("level", "cells", "points", "streamlines")} | resolution
     given = {name: value for name, value in given.items() if value is not None}
@@ -360,18 +350,9 @@ def _named(line: str) -> tuple[str, str]:
 
 
 def progress_bar(total: int, progress: bool, unit: str, line: str = "{elapsed}", done: int = 0) -> Any:
-    """Return a progress bar; where no terminal is watching, a plain line every few seconds.
+    """Return a progress bar over `total` units, `done` of them already; none without `progress`.
 
-    Parameters
-    ----------
-    total, done : int
-        How many there are, and how many of them are finished already.
-    progress : bool
-        Whether to show anything.
-    unit : str
-        What is counted.
-    line : str
-        What the plain line says behind the count, as tqdm's `bar_format` has it.
+    Where no terminal is watching it is a plain line every few seconds, with `line` in tqdm's terms behind the count.
     """
     from tqdm.auto import tqdm  # late: `--help` does without
 

@@ -256,8 +256,10 @@ def test_driver_that_starts_while_another_looks_for_leftovers_waits_for_its_own_
     first.__exit__()
     looking = os.open(tmp_path / "lock", os.O_RDWR)
     assert cases._lock(looking, cases.fcntl.F_WRLCK, 0)
-    monkeypatch.setattr(cases.time, "sleep", lambda _: os.close(looking))  # the other is done while this one waits
+    done = []
+    monkeypatch.setattr(cases.time, "sleep", lambda _: done.append(os.close(looking)))  # while this one waits
     with CaseFolder(tmp_path) as kept:
+        assert done
         third = os.open(tmp_path / "lock", os.O_RDWR)
         assert not cases._lock(third, cases.fcntl.F_WRLCK, 0)
         os.close(third)
