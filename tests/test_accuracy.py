@@ -127,8 +127,12 @@ def test_a_machine_with_a_pressing_force_is_measured_at_the_gap_that_carries_it(
 @pytest.mark.parametrize(
     ("values", "silent"),
     [
-        ({"strength.cushioning": "inf"}, True),  # closed form: no noise
-        ({"strength.reference_strength": "1e14 Pa", "feed": {"kind": "single", "size": 0.02}}, True),
+        pytest.param({"strength.cushioning": "inf"}, True, marks=pytest.mark.slow),  # closed form: no noise
+        pytest.param(
+            {"strength.reference_strength": "1e14 Pa", "feed": {"kind": "single", "size": 0.02}},
+            True,
+            marks=pytest.mark.slow,
+        ),
         ({"rolls.entry_gap": 0.06, "strength.cushioning": 0.5}, False),  # no pressure: 0 / 0 is no error
     ],
 )

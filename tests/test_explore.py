@@ -150,8 +150,8 @@ def test_page_holds_the_numbers_of_the_file(saved, capsys):
 def test_every_scalar_of_a_sweep_is_a_figure():
     """Summaries that are still to come need no line of the explorer: unit and name say all."""
     result = swept("one")
-    result["power"] = result["throughput"] * 2.0
-    result["power"].attrs = {"units": "W", "long_name": "power of both rolls"}
+    result["motor_power"] = result["throughput"] * 2.0
+    result["motor_power"].attrs = {"units": "W", "long_name": "power of both motors"}
     result["passes"] = (
         result["status"].dims,
         np.array([[1, 2], [4, 4]], np.int32),
@@ -159,8 +159,10 @@ def test_every_scalar_of_a_sweep_is_a_figure():
     )
     lose(result, "boom", gap=0, replicate=0)
     kpis = {one["heading"]: one for one in page.page_data(result, 1e-3, "x")["kpis"]}
-    agree(kpis["power [kW]"], flat(result, "power") / 1e3)
-    assert kpis["power [kW]"]["about"] == "power of both rolls"
+    agree(kpis["motor power [kW]"], flat(result, "motor_power") / 1e3)
+    assert kpis["motor power [kW]"]["about"] == "power of both motors"
+    agree(kpis["W [kWh/t]"], flat(result, "specific_energy") / 3600)
+    agree(kpis["Fsp [N/mm²]"], flat(result, "specific_pressing_force") / 1e6)
     assert kpis["passes"]["mean"] == [2, 4]  # of the replicate that is left: an integer has no NaN of its own
     assert kpis["passes"]["sd"] == [None, 0]
     assert not {"status", "flags"} & {one["heading"] for one in kpis.values()}

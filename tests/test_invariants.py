@@ -59,6 +59,7 @@ def test_any_scene_ends_well_flagged_or_refused(places, kind, chosen, snapshots,
         assert outcome.kind != "fault", outcome.message
 
 
+@pytest.mark.slow
 @given(st.floats(0, 1), st.floats(0, 1), st.floats(1e-3, 1e3), st.sampled_from([0, 1, 2, 3, 17]), st.booleans())
 def test_any_rolls_end_well_flagged_or_refused(gap_place, rise_place, diameter, cells, exchange):
     gap = diameter * 10 ** (6 * (gap_place - 1))
@@ -252,7 +253,7 @@ def assert_scaled(first, second, scale):
         assert np.array_equal(one * one.dtype.type(scale_of(variable.attrs["units"], **scale)), other), name
 
 
-@pytest.mark.parametrize("exchange", [False, True])
+@pytest.mark.parametrize("exchange", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("scale", [{"length": 4.0}, {"pressure": 8.0}, {"rate": 1024.0}], ids=str)
 def test_scaled_scenes_give_scaled_results(scale, exchange):
     """Lengths times 4 give sizes times 4; moduli and strength times 8 pressures times 8; speed changes rates only.
@@ -279,7 +280,7 @@ def test_scaled_scenes_give_scaled_results(scale, exchange):
     assert judged > sized(5, 0)
 
 
-@pytest.mark.parametrize("exchange", [False, True])
+@pytest.mark.parametrize("exchange", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_vanishing_cushioning_is_none(exchange):
     """n = inf, and n so large that cushioning is lost in rounding, give the same sizes bit for bit."""
     for scene in drawn(sized(15, 6), exchange, **{"strength.cushioning": INF}):

@@ -277,6 +277,7 @@ def test_no_bed_is_refused(scene):
         study.study(scene.with_values({"rolls.gap": 1.14}), SHOWN)
 
 
+@pytest.mark.slow
 def test_scenes_in_which_nothing_happens_are_drawn(tmp_path):
     """No pressure at all, hence no contour lines, no crushing, and one size everywhere in the animation."""
     small = {"resolution.streamlines": 1, "resolution.points": 11, "resolution.cells": 20}

@@ -57,7 +57,7 @@ def test_curves_are_told_apart_without_colour_and_alike_ones_drawn_once(figure):
     assert len(lines_of(upper[2])) == 4  # and the feed
     assert [len(lines_of(panel)) for panel in lower] == [2] * 5
     assert all(len(styles(panel)) == 2 for panel in lower)
-    assert [panel.get_title() for panel in lower[:2]] == ["throughput", "P80 (2 curves, 1 apart)"]
+    assert [panel.get_title() for panel in lower[:2]] == ["throughput", "P80 (all curves coincide)"]
     products, speeds = sorted(figure.legends, key=lambda legend: len(legend.get_texts()), reverse=True)
     assert texts(products) == [f"{gap} mm, 10 rpm (and 1 alike)" for gap in (60, 40, 50)]
     assert "swept: gap, roll speed" in products.get_title().get_text()
@@ -121,6 +121,7 @@ def test_caption_tells_replicates_and_remark(swept, figure):
     assert "Scene: not calibrated." in draw(remarked).get_supxlabel()
 
 
+@pytest.mark.slow
 def test_many_points_are_thinned_and_it_says_so():
     base = paper(BASE | {"resolution.cells": 20, "resolution.streamlines": 1})
     figure = draw(sweep(base, {"rolls.gap": np.linspace(0.03, 0.1, 11)}))
@@ -134,6 +135,7 @@ def test_many_points_are_thinned_and_it_says_so():
     assert "replicates" not in figure.get_supxlabel()  # there is one
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("field", "values", "labels"),
     [

@@ -132,7 +132,8 @@ def _product_sizes(panel, points: xr.Dataset, feed) -> None:
     seen = (fed > 0) & (np.cumsum(fed >= 100) <= 1)
     panel.plot(1e3 * sieves[seen], fed[seen], color="0.6", linewidth=3, alpha=0.7, zorder=0)
     middle = np.flatnonzero(seen)[seen.sum() // 2]
-    panel.annotate("feed of the scene", (1e3 * sieves[middle], fed[middle]), color="0.4", fontsize=9, ha="right")
+    place = {"xytext": (8, -10), "textcoords": "offset points", "color": "0.4", "fontsize": 9}
+    panel.annotate("feed of the scene", (1e3 * sieves[middle], fed[middle]), **place)
     panel.set(xscale="log", yscale="log", xlabel="sieve [mm]", ylabel="passing [%]", title="Product of the whole gap")
     panel.set_ylim(0.1, 130)
     low = sieves[np.argmax(passing.max(axis=0) > 0.1)]
@@ -160,7 +161,8 @@ def against_axis(panel, values: xr.DataArray, axis: xr.DataArray, heading: str) 
             panel.errorbar(shown[order], one.mean("replicate").values[order], error, label=label or None, **style)
         else:  # in the legend alone: what it coincides with is drawn
             panel.errorbar([], [], [], label=label, **style)
-    alike = f" ({count} curves, {len(groups)} apart)" if len(groups) < count else ""
+    alike = "all curves coincide" if len(groups) == 1 else f"{len(groups)} of {count} curves differ"
+    alike = f" ({alike})" if len(groups) < count else ""
     panel.set(xlabel=report.axis_label(axis), ylabel=heading, title=heading.partition(" [")[0] + alike)
     if values.max() > 0:
         low, high = panel.get_ylim()
