@@ -93,9 +93,11 @@ def _sobol(values: np.ndarray) -> np.ndarray:
 
     constant = np.ptp(values, axis=(1, 2), keepdims=True) == 0
     values = np.where(constant, np.arange(values.shape[2]), values)  # which SciPy would divide by; NaN in the end
+    figures, values = len(values), np.concatenate([values, values])  # it takes no single figure
     design = {"f_A": values[:, 0], "f_B": values[:, 1], "f_AB": values[:, 2:].transpose(1, 0, 2)}
     found = sobol_indices(func=design, n=values.shape[2])
-    return np.array([found.first_order, found.total_order])
+    orders = np.array([found.first_order, found.total_order])
+    return orders.reshape(2, len(values), -1)[:, :figures]
 
 
 def sensitivity(
