@@ -78,6 +78,7 @@ def test_nip_angle_of_the_published_worked_case():
     law = NipFlow(cake_solid_fraction=2.3 / 2.7)
     assert np.degrees(law.angle(0.03, 1.0, 1.6 / 2.7)) == pytest.approx(9.504, abs=5e-4)
     assert NipFlow(nip_angle=0.1).angle(0.03, 1.0, 1.6 / 2.7) == 0.1
+    assert NipFlow(cake_solid_fraction=0.7, slip=0.3).angle(0.03, 1.0, 0.6) == cake_nip_angle(0.03, 1.0, 0.7 / 0.6, 0.3)
 
 
 @given(st.floats(1e-3, 0.2), st.floats(0.0, 1.0), st.sampled_from([0.0, 0.3]))
@@ -179,6 +180,17 @@ def test_bed_dilates_first_and_compacts_low_down():
     assert not by_hand[0]
     # at the exit X' = 0, so only the vertical stretch at rate U/H is left
     assert motion.volumetric_rate[:, -1] == pytest.approx(-motion.speed[:, -1] / bed.height, rel=1e-12)
+
+
+def test_strain_of_the_papers_bed_converges_at_second_order_from_the_onset_in_its_step():
+    def strains(points):
+        _, _, steps = moved(paper(), points)
+        return np.cumsum(steps.volumetric, axis=1).max(axis=1)
+
+    exact = strains(6401)
+    coarse, fine = (np.abs(strains(points) / exact - 1) for points in (101, 401))
+    assert np.all(coarse < 4e-3)  # counted from the first point that compacts it would be a tenth
+    assert np.all(fine < coarse / 10)
 
 
 @given(st.floats(0.01, 5.0), st.floats(1e-6, 0.999), st.floats(0.0601, 3.05))

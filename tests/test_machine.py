@@ -339,6 +339,22 @@ def test_gap_of_a_coarse_bed_carries_the_force(force):
     assert machine.specific_pressing_force(found) == pytest.approx(force, rel=1e-6)
 
 
+def test_gap_of_a_bed_too_coarse_at_its_narrowest_is_found_where_it_presses():
+    """With three points and Euler's rule the narrowest bed is not pressed at all."""
+    coarse = {"elasticity.integrator": "euler", "resolution.points": 3, "rolls.entry_gap": 0.215}
+    scene = industrial(coarse | {"flow": NipFlow(nip_angle=0.19, entry_fraction=0.1), "bed.max_solid_fraction": 0.9})
+    narrow = scene.with_values({"rolls.gap": 0.045})
+    assert machine.specific_pressing_force(narrow) == 0
+    found = machine.float_gap(scene.with_values({"rolls.specific_pressing_force": 3.2e5}))
+    assert machine.specific_pressing_force(found) == pytest.approx(3.2e5, rel=1e-6)
+
+
+def test_a_bed_that_densifies_reaches_its_largest_solid_fraction_and_no_further():
+    held = {"elasticity.densification": 3.0, "bed.max_solid_fraction": 0.9, "rolls.specific_pressing_force": 1.0}
+    with pytest.raises(ValueError, match=r"below which the cake would be denser than max_solid_fraction 0\.9\)"):
+        machine.float_gap(industrial(held))
+
+
 @given(
     st.sampled_from(["paper", "khd_pilot", "industrial"]),
     st.one_of(
