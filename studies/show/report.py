@@ -95,8 +95,9 @@ def place_text(result: xr.Dataset, dim: str, index: int) -> str:
 def operating_points(result: xr.Dataset) -> xr.Dataset:
     """Return the result with its swept dims stacked into one dimension `operating_point`."""
     axes = axes_of(result)
-    if not axes:
-        return result.expand_dims("operating_point")
+    if not axes:  # coordinates of cases take no new dimension by themselves
+        cases = [name for name, value in result.coords.items() if "replicate" in value.dims and name != "replicate"]
+        return result.reset_coords(cases).expand_dims("operating_point").set_coords(cases)
     return result.stack(operating_point=axes, create_index=False)
 
 
