@@ -20,7 +20,7 @@ _inner = njit(**_HOW, no_cpython_wrapper=True)  # not to be called from Python: 
 _PANELS = 64  # 5-point Gauss on 64 panels: travel times to 1e-13 for every entry_fraction down to 1e-9
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
-_DENSEST = 0.9999  # of the largest solid fraction, where a bed that stiffens as pores close is held
+_DENSEST = 0.99  # of the largest solid fraction, where a bed that stiffens as pores close is held
 _TENSION_NOISE = 1e-9  # of the largest stress; less is rounding of the running sum
 
 

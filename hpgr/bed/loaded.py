@@ -178,7 +178,8 @@ def _power(inputs: BedInputs, geometry: Geometry, motion: Kinematics, strains: S
     work = between(state.pressure) * volumetric + between(state.shear_stress) * shear
     given_back = inputs.elasticity.recovered_energy(_on_roll(motion, state)[-1])
     given_back *= inputs.gap * inputs.surface_speed * inputs.mean_pressure(geometry, 0.0, 2.0)
-    return float(2 / tubes * (between(flux) * work).sum(where=volumetric > 0) - given_back)
+    done = 2 / tubes * (between(flux) * work).sum(where=volumetric > 0)
+    return float(max(done - given_back, 0.0))  # no cake gives back more than was put in
 
 
 def _press(inputs: BedInputs, geometry: Geometry, motion: Kinematics, strains: StepStrains, state: StressState):

@@ -39,7 +39,7 @@ def performance(scene: Scene, pressed: Pressed, throughput: float) -> Performanc
 
     The force angle beta is that of sin(beta) = P / (2 F U), so that W = 2000 Fsp sin(beta) / mdot holds for
     W in kWh/t, Fsp in N/mm2 and mdot = Q / (D L U) in t s/(h m3), as far as power goes into the bed (idle_torque = 0).
-    It is 0 where nothing is pressed.
+    It is 0 where nothing is pressed, and held at 90 degrees where the bed takes more than the force can give.
 
     Examples
     --------
@@ -51,6 +51,7 @@ def performance(scene: Scene, pressed: Pressed, throughput: float) -> Performanc
     """
     rolls = scene.rolls
     force, bed_power = pressed.force * rolls.width, pressed.power * rolls.width
+    most = 2 * force * rolls.surface_speed  # power that the force could give at an angle of 90 degrees
     power = bed_power + rolls.idle_torque * rolls.speed
     return Performance(
         pressing_force=force,
@@ -60,7 +61,7 @@ def performance(scene: Scene, pressed: Pressed, throughput: float) -> Performanc
         specific_energy=power / throughput,
         specific_throughput=throughput / (rolls.diameter * rolls.width * rolls.surface_speed),
         nip_angle=pressed.nip_angle,
-        force_angle=math.asin(min(bed_power / (2 * force * rolls.surface_speed), 1.0)) if force > 0 else 0.0,
+        force_angle=math.asin(bed_power / most) if bed_power < most else math.pi / 2 * (bed_power > 0),
     )
 
 

@@ -45,7 +45,7 @@ class GranularElasticity(Frozen):
     """Scaling of the bed's shear modulus."""
     exponent: Number = quantity(0.5, symbol="c", source="paper eq. 4; value ours (Hertz)", example=0.5, gt=-1, le=10)
     """Pressure sensitivity of granular elasticity."""
-    densification: Number = quantity(0.0, symbol="k_d", source="ours (0, the paper; 3 fitted)", example=3, ge=0, le=20)
+    densification: Number = quantity(0.0, symbol="k_d", source="ours (0, the paper; 3 fitted)", example=3, ge=0, le=4)
     """How the bed stiffens as pores close: phi^3 gains [(1 - phi_feed/phi_max) / (1 - phi/phi_max)]^k_d."""
     recovery_modulus: Pascals | None = quantity(
         None,
@@ -53,7 +53,7 @@ class GranularElasticity(Frozen):
         unit="Pa",
         source="ours (none, the paper; 3.3 GPa fitted)",
         example="3.3 GPa",
-        ge=1e3,
+        ge=1e7,
         le=1e15,
     )
     """Modulus of the cake past the gap, which follows the rolls apart until its stress is gone; None: it does not."""
