@@ -116,23 +116,6 @@ def test_edges_are_the_bisectors_cut_by_all_others_and_the_bed(streamlines, poin
         assert abs(lengths.get(pair, 0.0) - wanted.get(pair, 0.0)) < 1e-9 * found.domain.length
 
 
-@pytest.mark.parametrize("gap", [1e-6, 0.06, 10.0])
-def test_edges_lie_halfway_between_their_points_and_close_each_inner_cell(gap):
-    """Of a cell inside the bed: sum of length x outward normal = 0, and area = sum of length x distance / 4."""
-    places, found = tiled(scene_of(gap, 6, 40))
-    inner = shapely.distance(found.cells, found.domain.exterior) > 1e-12
-    assert inner.sum() > 50
-    lower, upper = found.pairs.T
-    flux, area, around = np.zeros_like(places), np.zeros(len(places)), np.zeros(len(places))
-    for side, sign in ((lower, 1), (upper, -1)):
-        np.add.at(flux, side, sign * found.length[:, None] * found.normal)
-        np.add.at(area, side, found.length * found.distance / 4)
-        np.add.at(around, side, found.length)
-    assert np.abs(flux[inner]).max() < 1e-9 * around[inner].max()
-    assert np.allclose(area[inner], found.volume.ravel()[inner], rtol=1e-6)
-    assert np.allclose(around[inner], shapely.length(found.cells[inner]), rtol=1e-6)
-
-
 # --- by hand -----------------------------------------------------------------------------------------------
 
 
