@@ -105,14 +105,6 @@ def load_bed(inputs: BedInputs) -> LoadedBed:
     ------
     ValueError
         If material points coincide.
-
-    Examples
-    --------
-    >>> import hpgr
-    >>> from hpgr.bed.loaded import inputs_of, load_bed
-    >>> bed = load_bed(inputs_of(hpgr.presets.industrial()))
-    >>> 1e6 < bed.pressed.force < 1e8  # N per m of roll width
-    True
     """
     xi, every = centres(inputs.streamlines), inputs.elasticity.substeps
     walled = inputs.between_rolls(np.append(xi, 1.0))  # the roll itself, whose force and power are wanted

@@ -40,14 +40,6 @@ def performance(scene: Scene, pressed: Pressed, throughput: float) -> Performanc
     The force angle beta is that of sin(beta) = P / (2 F U), so that W = 2000 Fsp sin(beta) / mdot holds for
     W in kWh/t, Fsp in N/mm2 and mdot = Q / (D L U) in t s/(h m3), as far as power goes into the bed (idle_torque = 0).
     It is 0 where nothing is pressed, and held at 90 degrees where the bed takes more than the force can give.
-
-    Examples
-    --------
-    >>> import hpgr
-    >>> from hpgr.bed import machine
-    >>> found = machine.performance(hpgr.presets.industrial(), machine.Pressed(8e6, 4e5, 0.159), throughput=200.0)
-    >>> round(found.specific_pressing_force / 1e6, 2), found.specific_energy  # N/mm2, J/kg
-    (3.64, 2000.0)
     """
     rolls = scene.rolls
     force, bed_power = pressed.force * rolls.width, pressed.power * rolls.width
@@ -66,15 +58,7 @@ def performance(scene: Scene, pressed: Pressed, throughput: float) -> Performanc
 
 
 def specific_pressing_force(scene: Scene) -> float:
-    """Return the specific pressing force F/(D L) of `scene` at its own gap, Pa, from the roll's streamline alone.
-
-    Examples
-    --------
-    >>> import hpgr
-    >>> from hpgr.bed import machine
-    >>> 1e6 < machine.specific_pressing_force(hpgr.presets.industrial()) < 9e6
-    True
-    """
+    """Return the specific pressing force F/(D L) of `scene` at its own gap, Pa, from the roll's streamline alone."""
     return _force_over_diameter(inputs_of(scene))
 
 
@@ -122,14 +106,6 @@ def float_gap(scene: Scene) -> Scene:
     ------
     ValueError
         If no gap carries that force.
-
-    Examples
-    --------
-    >>> import hpgr
-    >>> from hpgr.bed import machine
-    >>> scene = hpgr.presets.industrial().with_values({"rolls.specific_pressing_force": "4 N/mm^2"})
-    >>> round(machine.float_gap(scene).rolls.gap, 4)
-    0.0538
     """
     wanted = scene.rolls.specific_pressing_force
     if wanted is None:

@@ -26,12 +26,6 @@ class GranularElasticity(Frozen):
     down. Bound: psi is convex up to `largest_shear_ratio`; shear beyond it is taken as plastic. Closed limit: at
     constant phi any path adds up to `stiffness` times the state functions. Densification and recovery are ours, for
     real machines; without them the law is the paper's.
-
-    Examples
-    --------
-    >>> from hpgr.laws.elasticity import GranularElasticity
-    >>> GranularElasticity(bulk_modulus="28.3 MPa").bulk_modulus
-    28300000.0
     """
 
     kind: Literal["granular"] = "granular"
@@ -48,13 +42,7 @@ class GranularElasticity(Frozen):
     densification: Number = quantity(0.0, symbol="k_d", source="ours (0, the paper; 3 fitted)", example=3, ge=0, le=4)
     """How the bed stiffens as pores close: phi^3 gains [(1 - phi_feed/phi_max) / (1 - phi/phi_max)]^k_d."""
     recovery_modulus: Pascals | None = quantity(
-        None,
-        symbol="E_r",
-        unit="Pa",
-        source="ours (none, the paper; 3.3 GPa fitted)",
-        example="3.3 GPa",
-        ge=1e7,
-        le=1e15,
+        None, symbol="E_r", unit="Pa", source="ours (none; 3.3 GPa fitted)", example="3.3 GPa", ge=1e7, le=1e15
     )
     """Modulus of the cake past the gap, which follows the rolls apart until its stress is gone; None: it does not."""
     integrator: Literal["increment", "euler"] = "increment"

@@ -72,12 +72,6 @@ class NipFlow(_Profile):
     the logarithm of the tube's density ratio. Bound: see `densest_ratio`.
 
     Source: nip and cake of Torres & Casali, Minerals Engineering 22 (2009) 1137-1146; speeds ours.
-
-    Examples
-    --------
-    >>> from hpgr.laws.flow import NipFlow
-    >>> round(NipFlow(nip_angle="9 deg").nip_angle, 3)  # rad
-    0.157
     """
 
     kind: Literal["nip"] = "nip"
@@ -112,14 +106,7 @@ class NipFlow(_Profile):
         return np.where(np.real(height) > 1, kept, (1 - self.slip * height * height) / np.sqrt(1 + slope * slope))
 
     def angle(self, gap: float, diameter: float, feed_solid_fraction: float) -> float:
-        """Return the nip angle, as given or from the cake's solid fraction, rad.
-
-        Examples
-        --------
-        >>> from hpgr.laws.flow import NipFlow
-        >>> round(NipFlow(cake_solid_fraction=0.84).angle(0.0237, 0.8, 0.595), 3)
-        0.16
-        """
+        """Return the nip angle, as given or from the cake's solid fraction, rad."""
         if self.nip_angle is not None:
             return self.nip_angle
         return cake_nip_angle(gap, diameter, self.cake_solid_fraction / feed_solid_fraction, self.slip)
