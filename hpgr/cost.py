@@ -1,5 +1,6 @@
 """What a scene will cost, before it is run: memory against this machine's limit, and time."""
 
+import math
 import os
 from pathlib import Path
 from typing import NamedTuple
@@ -36,15 +37,18 @@ def predict(scene: Scene) -> Cost:
     lines, points, cells = grid.streamlines, grid.points, grid.cells
     slices = 1 if scene.roll_width is None else 2 * scene.roll_width.slices
     columns, frames = lines * slices, grid.snapshots
+    simple = math.isinf(scene.strength.scatter) and scene.fragments.size_exponent == 0
     fields = lines * ((points - 1) * scene.elasticity.substeps + 1)
     size, seconds = 150 * fields, 1.5e-3 + 0.25e-6 * fields  # motion and stress, with temporaries
     if solver == "closed form":
-        size += 5_000 * columns  # nodes of quadratures, places of a search
-        seconds += 40e-6 * columns + 2e-8 * slices * columns * len(grid.sieves)
+        each, time = (5_000, 40e-6) if simple else (26_000, 150e-6)  # nodes of quadratures, or classes of a cascade
+        everywhere = lines * points if grid.record == "distributions" else 0
+        size += each * max(columns, min(everywhere, 4000))  # at once, see hpgr.grains.solve
+        seconds += time * (columns + 0.5 * everywhere)
     elif cells:
         product = grid.snapshots * columns * cells
         at_once = max(os.cpu_count() or 1, 200_000 // cells)  # parcels, see hpgr.grains.march
-        size += (12 if slices == 1 else 60) * product  # kept, pooled, sorted; with slices ordered by their shares
+        size += (12 if slices == 1 else 38) * product  # kept, pooled, sorted; with slices ordered by their shares
         size += 40 * cells * min(columns * grid.snapshots, at_once)  # work space
         seconds += product * (0.2e-6 + 0.15e-9 * points)
     if solver == "lattice":
@@ -56,8 +60,7 @@ def predict(scene: Scene) -> Cost:
         size += 4 * frames * lines * points * cells
         seconds += 1e-9 * frames * lines * points * cells
     elif cells and grid.record == "distributions":
-        size += (84 if solver == "closed form" else 16) * frames * lines * points * (len(grid.sieves) + 1)
-        seconds += 1e-7 * frames * lines * points * len(grid.sieves)
+        size += (28 if solver == "closed form" else 16) * frames * lines * points * (len(grid.sieves) + 1)
     return Cost(size, seconds)
 
 
