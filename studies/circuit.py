@@ -18,7 +18,7 @@ from hpgr.laws.feed import TableFeed
 from hpgr.scene import Scene
 from studies import command as line
 from studies.command import Report, shown_as
-from studies.sweep.space import Space, axes_of
+from studies.sweep.space import Case, CaseResult, Space, SweepSpec, axes_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -211,91 +211,70 @@ def close_circuit(
     >>> bool(low > high > 0)
     True
     """
-    from hpgr.results import schema
-    from studies.sweep.assemble import coordinates
+    from studies.sweep.assemble import assemble
 
+    spec = SweepSpec(scene.with_values({"resolution.record": "product"}), seed)
     space = Space(axes_of(space or {}), replicates)
-    told = [_told(scene, returned, case, seed) for case in space.cases()]
-    states, messages = zip(*told, strict=True)
-    held = [values for values in states if values]
-    if not held:
-        raise ValueError(messages[0])
-    own = {name: entry._replace(dims=(*space.dims, *entry.dims)) for name, entry in _variables().items()}
-    blank = {name: np.full(np.shape(value), np.nan) for name, value in held[0].items()} | {
-        "flags": 0,
-        "diagnostics": "",
-    }
-    values = {
-        name: np.reshape([(one or blank)[name] for one in states], (*space.shape, *np.shape(blank[name])))
-        for name in blank
-        if name != "sieve"
-    }
-    status = [schema.STATUS["ok" if one else "refused"] for one in states]
-    values |= {
-        "status": np.reshape(status, space.shape),
-        "message": np.reshape(np.array(messages, object), space.shape),
-    }
-    own |= {name: schema.SWEEP[name]._replace(dims=space.dims) for name in ("status", "message", "diagnostics")}
-    title = "Closed circuit of high pressure grinding rolls"
-    attrs = schema.dataset_attributes(title, scene=scene.model_dump_json(), returned=repr(returned), seed=seed)
-    found = schema.to_dataset(values | {"sieve": held[0]["sieve"]}, attrs, own)
-    return found.assign_coords(coordinates(space)).set_coords(["status", "message", "diagnostics"])
+    results = [_case(spec, returned, case) for case in space.cases()]
+    if not any(one.summary for one in results):
+        raise ValueError(results[0].message)
+    return assemble(spec, space, results, _variables()).assign_attrs(returned=repr(returned))
 
 
-def _told(scene: Scene, returned: Any, case: Any, seed: int) -> tuple[dict[str, Any], str]:
-    """Return the variables of one point, or none and why."""
+def _case(spec: SweepSpec, returned: Screen | EdgeRecycle, case: Case) -> CaseResult:
+    """Return the steady state of one point, or why it has none."""
     try:
-        found = steady(scene.with_values(case.values), returned, seed, case.replicate)
+        found = steady(spec.base.with_values(case.values), returned, spec.seed, case.replicate)
     except ValidationError as error:
-        return {}, faults_of(error)
+        return CaseResult(case.index, "refused", faults_of(error), {})
     except ValueError as error:
-        return {}, str(error)
-    return _figures(found), ""
+        return CaseResult(case.index, "refused", str(error), {})
+    entries, values = _variables(), _figures(found)
+    summary = {name: np.asarray(value, entries[name].dtype) for name, value in values.items() if name in entries}
+    return CaseResult(case.index, "ok", "", summary, found.diagnostics)
 
 
 def _figures(found: Closed) -> dict[str, Any]:
-    """Return the variables of a steady state."""
-    sieves, load = np.array(found.values["sieve"]), found.load
-    feed = found.fresh + found.back
-    passing = {"feed_passing": feed, "recycle_passing": found.back, "product_passing": found.product}
-    shares = {name: np.cumsum(mass) / max(mass.sum(), 1e-300) for name, mass in passing.items()}
-    reach = np.log(sieves)[np.searchsorted(shares["product_passing"], 0.8) + np.array([-1, 0])]
-    parts = shares["product_passing"][np.searchsorted(shares["product_passing"], 0.8) + np.array([-1, 0])]
-    keep = ("throughput", "operating_gap", "specific_pressing_force", "power", "specific_energy", "flags")
-    return {
-        "sieve": sieves,
+    """Return the variables of a steady state, those of the rolls' last run among them."""
+    load = found.load
+    masses = {"feed_passing": found.fresh + found.back, "recycle_passing": found.back, "product_passing": found.product}
+    passing = {name: np.cumsum(mass) / max(mass.sum(), 1e-300) for name, mass in masses.items()}
+    own = {
         "circulating_load": load,
         "fresh_feed": found.values["throughput"] / (1 + load),
         "product_energy": found.values["specific_energy"] * (1 + load),
-        "product_p80": math.exp(np.interp(0.8, parts, reach)),
+        "product_p80": math.exp(np.interp(0.8, passing["product_passing"], np.log(_SIEVES))),
         "mass_balance": found.fresh.sum() - found.product.sum(),
         "residual": found.residual,
         "iterations": found.iterations,
-        "rolls_passing": np.asarray(found.values["passing_total"], float),
-        **shares,
-        **{name: found.values[name] for name in keep if found.values.get(name) is not None},
-        "diagnostics": found.diagnostics,
     }
+    return {name: value for name, value in found.values.items() if value is not None} | own | passing
 
 
 def _variables() -> dict[str, Any]:
-    from hpgr.results.schema import VARIABLES, Variable
+    """Return what a circuit's Dataset has: the rolls' variables, and its own."""
+    from hpgr.results.schema import COORDINATES, VARIABLES, Variable
 
-    per = "per unit of fresh feed"
-    sieve = ("sieve",)
-    return VARIABLES | {
-        "circulating_load": Variable((), "1", "circulating load", "recycle over fresh feed"),
-        "fresh_feed": Variable((), "kg s-1", "fresh feed", "and product of the circuit"),
-        "product_energy": Variable((), "J kg-1", "specific energy of the product", "power over product of the circuit"),
-        "product_p80": Variable((), "m", "P80 of the circuit's product"),
-        "mass_balance": Variable((), "1", "fresh feed less product", per, np.float64),
-        "residual": Variable((), "1", "change of the recycle in the last round", per, np.float64),
-        "iterations": Variable((), "1", "rounds of the recycle"),
-        "rolls_passing": Variable(sieve, "1", "mass fraction passing", "product of the rolls"),
-        "feed_passing": Variable(sieve, "1", "mass fraction passing", "feed of the rolls"),
-        "recycle_passing": Variable(sieve, "1", "mass fraction passing", "what goes back"),
-        "product_passing": Variable(sieve, "1", "mass fraction passing", "product of the circuit"),
-    }
+    per, sieve = "per unit of fresh feed", ("sieve",)
+    rolls = {name: entry for name, entry in VARIABLES.items() if not {"point", "cell", "time"} & set(entry.dims)}
+    return (
+        {name: COORDINATES[name] for name in ("xi", "sieve")}
+        | rolls
+        | {
+            "circulating_load": Variable((), "1", "circulating load", "recycle over fresh feed"),
+            "fresh_feed": Variable((), "kg s-1", "fresh feed", "and product of the circuit"),
+            "product_energy": Variable(
+                (), "J kg-1", "specific energy of the product", "power over product of the circuit"
+            ),
+            "product_p80": Variable((), "m", "P80 of the circuit's product"),
+            "mass_balance": Variable((), "1", "fresh feed less product", per, np.float64),
+            "residual": Variable((), "1", "change of the recycle in the last round", per, np.float64),
+            "iterations": Variable((), "1", "rounds of the recycle"),
+            "feed_passing": Variable(sieve, "1", "mass fraction passing", "feed of the rolls"),
+            "recycle_passing": Variable(sieve, "1", "mass fraction passing", "what goes back"),
+            "product_passing": Variable(sieve, "1", "mass fraction passing", "product of the circuit"),
+        }
+    )
 
 
 _SHOWN = {
@@ -322,7 +301,7 @@ def table(result: "xr.Dataset") -> str:
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(line.Common):
     """Options of the closed circuit; sizes are text with a unit."""
 
     cut: Annotated[str | None, shown_as("LENGTH")] = None
@@ -335,15 +314,8 @@ class Options:
     """Return the product of the roll's edges, in place of a screen's oversize."""
     vary: line.Vary = ()
     scene: line.SceneName = "industrial"
-    level: line.Level = None
-    cells: line.Cells = None
-    points: line.Points = None
-    streamlines: line.Streamlines = None
     replicates: line.Replicates = 1
-    seed: line.Seed = 0
     out: line.Out = Path("outputs/circuit.nc")
-    plot: line.Plot = True
-    overwrite: line.Overwrite = False
 
 
 @line.command("circuit", __doc__)

@@ -8,6 +8,7 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
@@ -76,6 +77,19 @@ Quick = Annotated[Flag, shown_as("", "Fewer and coarser runs: seconds instead of
 Out = Annotated[Path, shown_as("FILE", "NetCDF file to write; the figure goes beside it, as .png.")]
 Plot = Annotated[bool, shown_as("", "Draw the figure, or not.")]
 Overwrite = Annotated[Flag, shown_as("", "Replace files that are not this command's own earlier result.")]
+
+
+@dataclass(frozen=True)
+class Common:
+    """Options that studies of one scene have in common."""
+
+    level: Level = None
+    cells: Cells = None
+    points: Points = None
+    streamlines: Streamlines = None
+    seed: Seed = 0
+    plot: Plot = True
+    overwrite: Overwrite = False
 
 
 def base_scene(options: Any, **resolution: Any) -> Scene:

@@ -66,8 +66,8 @@ class Optimum(NamedTuple):
     without_effect : list of str
         Which field does not matter to what.
     tradeoff : xarray.Dataset
-        Figures of every point of the design along `sample`, the fields as coordinates; `best_energy` and
-        `best_throughput` tell which points no other beats in fineness and in these.
+        The sweep over the design, with `best_energy` and `best_throughput`: whether no other point is finer and better
+        in these.
     """
 
     scene: Scene
@@ -158,8 +158,8 @@ class _Search:
         self.ends, self.objective, self.limits, self.sign, self.seed = ends, objective, limits, sign, seed
         self.asked = list(dict.fromkeys([objective, *(limit.quantity for limit in limits)]))
         self.fineness = next((one for one in self.asked if one.of_product), quantity_of("p80"))
-        traded = [self.fineness, quantity_of("specific energy"), quantity_of("throughput")]
-        self.every = list(dict.fromkeys([*self.asked, *traded]))
+        self.traded = [self.fineness, quantity_of("specific energy"), quantity_of("throughput")]
+        self.every = list(dict.fromkeys([*self.asked, *self.traded]))
         self.own, self.scene, self.beds = scene, with_sieves(scene, self.every), Beds(4)
         random = solve.choose(self.scene) in ("march", "lattice") and any(one.of_product for one in self.asked)
         self.replicates, self.judges = (_REPLICATES, _JUDGES) if random else (1, 1)
@@ -219,7 +219,11 @@ class _Search:
             self.known[tuple(np.round(point, 12).tolist())] = dict(zip(self.every, values, strict=True))
         spans = np.nanmax(means, axis=1) - np.nanmin(means, axis=1)
         self.scales = {one: span or 1.0 for one, span in zip(self.every, spans.tolist(), strict=True)}
-        return _tradeoff(result, dict(zip(self.every, figures, strict=True)), self.fineness)
+        fine, energy, throughput = (means[self.every.index(one)] for one in self.traded)
+        fine = fine if self.fineness.sieve else -fine
+        better = {"best_energy": _unbeaten(fine, -energy), "best_throughput": _unbeaten(fine, throughput)}
+        words = {"long_name": "no other point is finer and better", "units": "1"}
+        return result.assign({name: ("sample", flags.astype(np.int8), words) for name, flags in better.items()})
 
     def without_effect(self) -> list[str]:
         """Say which field does not matter to which figure that was asked about; free those that matter to any."""
@@ -230,7 +234,7 @@ class _Search:
                 ends = np.full((2, len(self.ends)), middle)
                 ends[:, k] = 0, 1
                 pairs.append(list(map(self.figures, ends)))
-            same = [one for one in self.asked if not any(_differ(low[one], high[one]) for low, high in pairs)]
+            same = [one for one in self.asked if all(math.isclose(a[one], b[one], rel_tol=_SAME) for a, b in pairs)]
             if len(same) == len(self.asked):
                 self.free.remove(field)
             if same:
@@ -315,34 +319,6 @@ class _Search:
         return found
 
 
-def _differ(one: float, other: float) -> bool:
-    return not abs(one - other) <= _SAME * max(abs(one), abs(other))  # NaN differs
-
-
-def _tradeoff(result: "xr.Dataset", figures: Mapping[Quantity, np.ndarray], fineness: Quantity) -> "xr.Dataset":
-    """Return figures (sample, replicate) as means with errors, and which points are beaten by none."""
-    from hpgr.results import schema
-
-    values, own, means = {}, {}, {}
-    for one, each in figures.items():
-        means[one] = each.mean(axis=1)
-        spread = each.std(axis=1, ddof=1) if each.shape[1] > 1 else np.zeros(len(each))
-        values |= {one.plain: means[one], f"{one.plain}_error": 2 * spread / math.sqrt(each.shape[1])}
-        own[one.plain] = schema.Variable(("sample",), one.unit, one.words)
-        own[f"{one.plain}_error"] = schema.Variable(
-            ("sample",), one.unit, f"error of {one.words}", "two standard errors"
-        )
-    fine = means[fineness] * (1 if fineness.sieve else -1)
-    for name, sign in (("specific energy", -1), ("throughput", 1)):
-        key = f"best_{name.rpartition(' ')[2]}"
-        values[key] = _unbeaten(fine, sign * means[quantity_of(name)])
-        own[key] = schema.Variable(("sample",), "1", f"best {name}", "no finer point is better", np.int8)
-    title = "Operating points of high pressure grinding rolls"
-    attrs = schema.dataset_attributes(title, scene=result.attrs["scene"], fineness=fineness.plain)
-    along = {name: value for name, value in result.coords.items() if value.dims == ("sample",)}
-    return schema.to_dataset(values, attrs, own).assign_coords(along)
-
-
 def _unbeaten(*figures: np.ndarray) -> np.ndarray:
     """Return which points no other beats in every figure, the larger the better."""
     every = np.stack(figures, axis=-1)
@@ -354,7 +330,7 @@ def _unbeaten(*figures: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(line.Common):
     """Options of the optimum; ranges and bounds are text with units."""
 
     vary: line.Vary = ()
@@ -365,16 +341,9 @@ class Options:
     subject_to: Annotated[tuple[str, ...], shown_as("BOUND ...")] = ()
     """Bounds, such as "passing 6 mm >= 60 %" "throughput >= 200 t/h"."""
     scene: line.SceneName = "industrial"
-    level: line.Level = None
-    cells: line.Cells = None
-    points: line.Points = None
-    streamlines: line.Streamlines = None
     workers: Annotated[int, shown_as("N")] = 2
     """Threads of this process to run the design on."""
-    seed: line.Seed = 0
     out: line.Out = Path("outputs/optimum.nc")
-    plot: line.Plot = True
-    overwrite: line.Overwrite = False
 
 
 def _files(options: Options) -> list[Path]:

@@ -44,11 +44,6 @@ class Quantity(NamedTuple):
         return ("%", 100.0) if self.sieve is not None else unit_shown(self.unit)
 
     @property
-    def plain(self) -> str:
-        """The words as the name of a variable."""
-        return self.words.replace(" ", "_").replace(".", "_")
-
-    @property
     def label(self) -> str:
         """Words with the unit."""
         return f"{self.words} [{self.shown[0]}]"

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from hpgr.scene import Scene, field_info
+from hpgr.scene import Scene
 from studies import command as line
 from studies.command import Report, shown_as
 from studies.quantities import quantity_of, refuse_lost, with_sieves
-from studies.sweep.space import between, ends_of, field_of, sobol_points
+from studies.sweep.space import ends_of, field_of, sobol_points
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -26,7 +26,7 @@ _ORDERS = ("first_order", "total_order")
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(line.Common):
     """Options of the sensitivity study; ranges are text with units, such as --vary "gap=40 mm..60 mm"."""
 
     vary: line.Vary = ()
@@ -37,17 +37,10 @@ class Options:
     sample: Annotated[int, shown_as("N")] = 512
     """Points of the design, a power of two; N (fields + 2) cases are run."""
     scene: line.SceneName = "paper"
-    level: line.Level = None
-    cells: line.Cells = None
-    points: line.Points = None
-    streamlines: line.Streamlines = None
     sieve: line.Sieve = "1 mm"
     workers: Annotated[int, shown_as("N")] = 2
     """Threads of this process to run cases on."""
-    seed: line.Seed = 0
     out: line.Out = Path("outputs/sensitivity.nc")
-    plot: line.Plot = True
-    overwrite: line.Overwrite = False
 
 
 def indices(function: Callable[[np.ndarray], np.ndarray], fields: int, count: int, seed: int = 0) -> np.ndarray:
@@ -178,23 +171,16 @@ def _rows(over: Any) -> tuple[tuple[str, ...], Callable[[np.ndarray], list[tuple
     given = {field_of(name): values for name, values in over.items()}
     if not given:
         raise ValueError("over: got no fields; give ranges; such as {'gap': ('40 mm', '60 mm')}")
-    ranges = ends_of({field: ends for field, ends in given.items() if isinstance(ends, tuple) and len(ends) == 2})
-    drawn = {
-        field: np.sort(np.asarray(values, float).ravel()) for field, values in given.items() if field not in ranges
-    }
-    if any(not np.isfinite(values).all() for values in drawn.values()):
+    ranges = ends_of({field: ends for field, ends in given.items() if isinstance(ends, tuple)})
+    drawn = {field: np.asarray(ranges.get(field, values), float).ravel() for field, values in given.items()}
+    if not all(np.isfinite(values).all() for values in drawn.values()):
         raise ValueError("over: got samples that are not finite; leave them out")
 
     def rows(unit: np.ndarray) -> list[tuple]:
-        columns = {
-            field: np.quantile(drawn[field], unit[:, [k]])[:, 0].tolist()
-            if field in drawn
-            else [row[0] for row in between({field: ranges[field]}, unit[:, [k]])]
-            for k, field in enumerate(given)
-        }
-        return list(zip(*columns.values(), strict=True))
+        columns = (np.quantile(values, unit[:, k]).tolist() for k, values in enumerate(drawn.values()))
+        return list(zip(*columns, strict=True))
 
-    return tuple(given), rows
+    return tuple(drawn), rows
 
 
 def table(result: "xr.Dataset") -> str:
@@ -234,15 +220,7 @@ def main(options: Options) -> Report:
 
         return sensitivity_figure(result)
 
-    told = [f"{name}: {_shown(name, ends)}" for name, ends in ranges.items()]
-    return Report([*told, "", table(result)], [result, line.figure(drawn)])
-
-
-def _shown(name: str, ends: Any) -> str:
-    from hpgr.fields import show
-
-    unit = field_info(name).unit
-    return f"{show(float(min(ends)), unit)} to {show(float(max(ends)), unit)}"
+    return Report([table(result)], [result, line.figure(drawn)])
 
 
 if __name__ == "__main__":

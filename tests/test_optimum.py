@@ -60,7 +60,7 @@ def test_one_force_meets_a_bound_and_speed_does_not_matter(client):
     assert best.without_effect == ["rolls.speed does not matter to specific energy, passing 6 mm; it is not varied"]
     assert best.values["rolls.speed"] == scene.rolls.speed
     front = best.tradeoff["best_energy"].values.astype(bool)
-    energy, fine = (best.tradeoff[name].values[front] for name in ("specific_energy", "passing_6_mm"))
+    energy, fine = (quantity_of(name).of(best.tradeoff).values[front, 0] for name in ("energy", "passing 6 mm"))
     assert (np.diff(energy[np.argsort(fine)]) >= 0).all()
     assert len(optimum_figure(best).axes) == 2
 

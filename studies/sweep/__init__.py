@@ -128,7 +128,7 @@ def sweep(
     with ExitStack() as stack:
         kept = None if folder is None else stack.enter_context(cases.CaseFolder(folder, recompute))
         plan = run.Plan(spec, space._replace(replicates=int(replicates)), kept)
-        result = assemble.assemble(plan, run.results(plan, client, threads, task, progress))
+        result = assemble.assemble(spec, plan.space, run.results(plan, client, threads, task, progress))
         if spec.whole:
             assemble.write_manifest(plan, result)
         return result

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from hpgr.results import schema
 from hpgr.scene import Scene
 from studies.sweep import netcdf
 from studies.sweep.run import Plan
-from studies.sweep.space import AXES, SCENE, Axis, CaseResult, Space, dim_of, plain
+from studies.sweep.space import AXES, SCENE, Axis, CaseResult, Space, SweepSpec, dim_of, plain
 
 _MANIFEST = "sweep.json"
 _MOST_BYTES = 100_000_000  # of a manifest that is read: two million cases
@@ -23,9 +23,13 @@ _ADDRESS = re.compile("[0-9a-f]{32}")
 _IN_FILES = {"time": "snapshot"}  # names that differ in files, see `netcdf.write_dataset`
 
 
-def assemble(plan: Plan, results: Iterable[CaseResult]) -> xr.Dataset:
-    """Return one Dataset of all results over the axes and replicates, the same whatever their order."""
-    spec, space = plan.spec, plan.space
+def assemble(
+    spec: SweepSpec, space: Space, results: Iterable[CaseResult], more: Mapping[str, schema.Variable] = {}
+) -> xr.Dataset:
+    """Return one Dataset of all results over the space, the same whatever their order.
+
+    Variables that no simulation has are in `more`.
+    """
     values: dict[str, Any] = {
         "status": np.full(space.shape, schema.STATUS["failed"], np.int8),
         "message": np.full(space.shape, "", object),
@@ -56,12 +60,12 @@ def assemble(plan: Plan, results: Iterable[CaseResult]) -> xr.Dataset:
     attrs |= {} if spec.tolerance is None else {"tolerance": spec.tolerance}
     if SCENE in space.axes:
         attrs["scenes"] = json.dumps({name: one.model_dump_json() for name, one in space.bases(spec.base).items()})
-    order = [*schema.COORDINATES, *schema.VARIABLES, *schema.SWEEP]
+    order = [*schema.COORDINATES, *more, *schema.VARIABLES, *schema.SWEEP]
     found = {name: values[name] for name in order if name in values and name not in uneven}
-    return _labelled(space, found, attrs).assign_coords(_held(spec.base, space))
+    return _labelled(space, found, attrs, more).assign_coords(_held(spec.base, space))
 
 
-def coordinates(space: Space) -> dict[str, xr.Variable]:
+def _coordinates(space: Space) -> dict[str, xr.Variable]:
     """Return the coordinates along the dimensions of a sweep: fields, and what places are called."""
     found = {}
     for dim, axis in space.axes.items():
@@ -74,16 +78,18 @@ def coordinates(space: Space) -> dict[str, xr.Variable]:
     return found | {"replicate": xr.Variable(("replicate",), numbers, schema.attributes("replicate"))}
 
 
-def _labelled(space: Space, values: dict[str, Any], attrs: dict[str, Any]) -> xr.Dataset:
+def _labelled(
+    space: Space, values: dict[str, Any], attrs: dict[str, Any], more: Mapping[str, schema.Variable] = {}
+) -> xr.Dataset:
     """Return arrays over the dimensions of a sweep and those of a simulation as a Dataset."""
     own = {
         name: entry._replace(dims=(*space.dims, *entry.dims))
-        for name, entry in (schema.COORDINATES | schema.VARIABLES | schema.SWEEP).items()
+        for name, entry in {**schema.COORDINATES, **schema.VARIABLES, **schema.SWEEP, **more}.items()
         if name not in space.dims and not _common(name)
     }
     # what a mean over replicates has no sense of is a coordinate, which xarray leaves out of it
     apart = [name for name in (*schema.SWEEP, "flags") if name in values]
-    return schema.to_dataset(values, attrs, own).set_coords(apart).assign_coords(coordinates(space))
+    return schema.to_dataset(values, attrs, own).set_coords(apart).assign_coords(_coordinates(space))
 
 
 def _common(name: str) -> bool:

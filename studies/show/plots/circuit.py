@@ -9,7 +9,7 @@ from studies.show import report
 
 _STREAMS = {
     "feed_passing": ("feed of the rolls", "--"),
-    "rolls_passing": ("product of the rolls", "-"),
+    "passing_total": ("product of the rolls", "-"),
     "recycle_passing": ("recycle", ":"),
     "product_passing": ("product of the circuit", "-."),
 }

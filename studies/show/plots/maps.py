@@ -39,43 +39,31 @@ def maps_figure(result: xr.Dataset, sieve: float, caption: str) -> Figure:
     across, up = (result[name] for name in report.axes_of(result))
     figure = Figure(figsize=(11, 9 if len(headings) > 2 else 5), layout="constrained")
     for panel, heading in zip(figure.subplots(-(-len(headings) // 2), 2).ravel(), headings, strict=True):
-        _map(panel, known[heading].mean("replicate"), across, up)
-        _hatch(panel, result, across, up)
+        _map(panel, result, known[heading].mean("replicate"), across, up)
         panel.set_title(heading)
     usual = "Dots: operating points that were run; hatched: outside usual machines and operation."
     caption_under(figure, result, f"{caption}\n{usual}" if caption else usual)
     return figure
 
 
-def _map(panel, values: xr.DataArray, across: xr.DataArray, up: xr.DataArray) -> None:
-    """Draw filled contours of a figure, labelled lines on them, and where they were measured."""
+def _map(panel, result: xr.Dataset, values: xr.DataArray, across: xr.DataArray, up: xr.DataArray) -> None:
+    """Draw filled contours of a figure, labelled lines on them, where it was run and where that is unusual."""
     x, y = report.shown_values(across), report.shown_values(up)
     columns, rows = np.argsort(x), np.argsort(y)
-    heights = np.ma.masked_invalid(values.transpose(up.name, across.name).values[np.ix_(rows, columns)])
+    unusual = (result["flags"] & flags.BITS["unusual_machine"]).any("replicate")
+    heights, unusual = (
+        each.transpose(up.name, across.name).values[np.ix_(rows, columns)].astype(float) for each in (values, unusual)
+    )
+    x, y, heights = x[columns], y[rows], np.ma.masked_invalid(heights)
     panel.set(xlabel=report.axis_label(across), ylabel=report.axis_label(up))
     if heights.count() and np.ptp(heights.compressed()) > 1e-6 * np.abs(heights).max():  # else all of it is rounding
-        panel.contourf(x[columns], y[rows], heights, levels=12, cmap=colours.batlow, alpha=0.85)
-        lines = panel.contour(x[columns], y[rows], heights, levels=7, colors="k", linewidths=0.7)
+        panel.contourf(x, y, heights, levels=12, cmap=colours.batlow, alpha=0.85)
+        lines = panel.contour(x, y, heights, levels=7, colors="k", linewidths=0.7)
         panel.clabel(lines, fmt=lambda value: f"{value:.4g}", fontsize=8)
     else:
         panel.text(0.5, 0.5, f"the same everywhere: {heights.mean():.4g}", ha="center", transform=panel.transAxes)
-    held = np.argwhere(values.transpose(across.name, up.name).notnull().values)
-    panel.plot(
-        x[held[:, 0]],
-        y[held[:, 1]],
-        ".",
-        color="w",
-        markeredgecolor="k",
-        markersize=5,
-        markeredgewidth=0.5,
-        clip_on=False,
-    )
-
-
-def _hatch(panel, result: xr.Dataset, across: xr.DataArray, up: xr.DataArray) -> None:
-    x, y = report.shown_values(across), report.shown_values(up)
-    columns, rows = np.argsort(x), np.argsort(y)
-    unusual = ((result["flags"] & flags.BITS["unusual_machine"]) > 0).any("replicate").astype(float)
-    field = unusual.transpose(up.name, across.name).values[np.ix_(rows, columns)]
-    if field.any():
-        panel.contourf(x[columns], y[rows], field, levels=[0.5, 1.5], colors="none", hatches=["//"])
+    if unusual.any():
+        panel.contourf(x, y, unusual, levels=[0.5, 1.5], colors="none", hatches=["//"])
+    up_places, across_places = np.nonzero(~np.ma.getmaskarray(heights))
+    style = {"color": "w", "markeredgecolor": "k", "markersize": 5, "markeredgewidth": 0.5, "clip_on": False}
+    panel.plot(x[across_places], y[up_places], ".", **style)

@@ -3,9 +3,11 @@
 from typing import TYPE_CHECKING
 
 import cmcrameri.cm as colours
+import numpy as np
 from matplotlib.figure import Figure
 
 from studies.quantities import Quantity, quantity_of
+from studies.show import report
 
 if TYPE_CHECKING:
     from studies.optimum import Optimum
@@ -13,8 +15,7 @@ if TYPE_CHECKING:
 
 def optimum_figure(best: "Optimum") -> Figure:
     """Return energy and throughput against fineness, of every point of the design, and the best point."""
-    result = best.tradeoff
-    fineness = next(one for one in map(quantity_of, best.figures) if one.plain == result.attrs["fineness"])
+    fineness = next(one for one in map(quantity_of, best.figures) if one.of_product)
     figure = Figure(figsize=(11, 4.8), layout="constrained")
     for panel, name in zip(figure.subplots(1, 2), ("specific energy", "throughput"), strict=True):
         _tradeoff(panel, best, fineness, quantity_of(name))
@@ -29,11 +30,12 @@ def optimum_figure(best: "Optimum") -> Figure:
 def _tradeoff(panel, best: "Optimum", across: Quantity, up: Quantity) -> None:
     result = best.tradeoff
     unbeaten = result[f"best_{up.words.rpartition(' ')[2]}"].values.astype(bool)
+    each = [one.of(result).astype(float) * one.shown[1] for one in (across, up)]
+    bars = [np.nan_to_num(2 * report.spread(values) / result.sizes["replicate"] ** 0.5) for values in each]
+    (x, y), (xerr, yerr) = (values.mean("replicate").values for values in each), bars
     for chosen, style in ((~unbeaten, {"color": "0.7", "label": "another is finer and better"}), (unbeaten, _UNBEATEN)):
-        x, y = ((result[one.plain].values[chosen], one.shown[1]) for one in (across, up))
-        bars = (result[f"{one.plain}_error"].values[chosen] * one.shown[1] for one in (across, up))
-        xerr, yerr = bars
-        panel.errorbar(x[0] * x[1], y[0] * y[1], yerr, xerr, fmt="o", markersize=4, linewidth=0.8, **style)
+        errors = {"xerr": xerr[chosen], "yerr": yerr[chosen]}
+        panel.errorbar(x[chosen], y[chosen], **errors, fmt="o", markersize=4, linewidth=0.8, **style)
     place = (best.figures[one.words][0] * one.shown[1] for one in (across, up))
     panel.plot(*place, "*", color=colours.batlow(0.75), markeredgecolor="k", markersize=15, label="best")
     panel.set(xlabel=across.label, ylabel=up.label)
