@@ -142,7 +142,8 @@ def _gap_carrying(inputs: BedInputs, wanted: float) -> float:
         raise ValueError(
             f"{_refused(wanted)} within the reachable {show(force(high), 'Pa')} (gap {show(wide, 'm')}) to "
             f"{show(force(low), 'Pa')} (gap {show(math.exp(low), 'm')}, below which {below}); choose a force within, "
-            "or another bulk modulus, nip angle or entry gap"
+            "or another bulk modulus (the default is that of loose sand; base = 'industrial' has an ore's), nip angle "
+            "or entry gap"
         )
     found = _root(excess, low, high)
     if abs(force(found) / wanted - 1) > _CARRIED:
