@@ -149,21 +149,22 @@ def _limit(name: str, text: str) -> Limit:
 
 
 class _Search:
-    """A search in the unit cube of the ranges; figures are means over replicates, by name, and are kept."""
+    """A search in the unit cube of the ranges; figures, the objective first, are means over replicates, and are kept."""
 
     def __init__(self, scene: Scene, ends: dict, objective: Quantity, limits: list[Limit], sign: int, seed: int):
         from hpgr.bed.loaded import Beds
         from hpgr.grains import solve
 
-        self.ends, self.objective, self.limits, self.sign, self.seed = ends, objective, limits, sign, seed
+        self.ends, self.limits, self.sign, self.seed = ends, limits, sign, seed
         self.asked = list(dict.fromkeys([objective, *(limit.quantity for limit in limits)]))
-        self.fineness = next((one for one in self.asked if one.of_product), quantity_of("p80"))
-        self.traded = [self.fineness, quantity_of("specific energy"), quantity_of("throughput")]
+        fineness = next((one for one in self.asked if one.of_product), quantity_of("p80"))
+        self.traded = [fineness, quantity_of("specific energy"), quantity_of("throughput")]
         self.every = list(dict.fromkeys([*self.asked, *self.traded]))
         self.own, self.scene, self.beds = scene, with_sieves(scene, self.every), Beds(4)
         random = solve.choose(self.scene) in ("march", "lattice") and any(one.of_product for one in self.asked)
         self.replicates, self.judges = (_REPLICATES, _JUDGES) if random else (1, 1)
-        self.free, self.known, self.scales = list(ends), {}, {}
+        self.bounded = [self.every.index(limit.quantity) for limit in limits]
+        self.free, self.known, self.scales = list(ends), {}, np.ones(len(self.every))
 
     def values(self, unit: np.ndarray) -> dict[str, Any]:
         """Return the fields' values at a point; a field that does not matter keeps the scene's, within its range."""
@@ -184,24 +185,22 @@ class _Search:
             return np.full((len(self.every), len(replicates)), np.nan)
         return np.array([[one.of(values) for values in runs] for one in self.every], float)
 
-    def figures(self, unit: np.ndarray) -> dict[Quantity, float]:
+    def figures(self, unit: np.ndarray) -> np.ndarray:
         """Return the mean figures at a point."""
         key = tuple(np.round(unit, 12).tolist())
         if key not in self.known:
-            means = self.run(unit, range(self.replicates)).mean(axis=1).tolist()
-            self.known[key] = dict(zip(self.every, means, strict=True))
+            self.known[key] = self.run(unit, range(self.replicates)).mean(axis=1)
         return self.known[key]
 
     def slacks(self, unit: np.ndarray) -> np.ndarray:
         """Return how far figures are from their bounds, in parts of their ranges; below 0 the bound is not met."""
         found = self.figures(unit)
-        each = [limit.slack(found[limit.quantity]) / self.scales[limit.quantity] for limit in self.limits]
+        each = [limit.slack(found[k]) / self.scales[k] for limit, k in zip(self.limits, self.bounded, strict=True)]
         return np.nan_to_num(each, nan=-1.0)
 
     def merit(self, unit: np.ndarray) -> float:
         """Return what is to be least: the objective in parts of its range."""
-        value = self.sign * self.figures(unit)[self.objective] / self.scales[self.objective]
-        return 1e3 if math.isnan(value) else value
+        return float(np.nan_to_num(self.sign * self.figures(unit)[0] / self.scales[0], nan=1e3))
 
     def design(self, options: Mapping[str, Any]) -> "xr.Dataset":
         """Run the corners of the cube and a Sobol sequence in it; return their figures and what is traded."""
@@ -213,14 +212,12 @@ class _Search:
         result = sweep(self.scene, {tuple(self.ends): between(self.ends, unit)}, self.replicates, self.seed, **options)
         if not (result["status"] == 0).any():
             refuse_lost(result)
-        figures = np.array([one.of(result).transpose("sample", "replicate") for one in self.every], float)
-        means = figures.mean(axis=2)
-        for point, values in zip(unit, means.T.tolist(), strict=True):
-            self.known[tuple(np.round(point, 12).tolist())] = dict(zip(self.every, values, strict=True))
+        means = np.array([one.of(result).mean("replicate", dtype=float) for one in self.every])
+        self.known |= {tuple(np.round(point, 12).tolist()): means[:, k] for k, point in enumerate(unit)}
         spans = np.nanmax(means, axis=1) - np.nanmin(means, axis=1)
-        self.scales = {one: span or 1.0 for one, span in zip(self.every, spans.tolist(), strict=True)}
+        self.scales = np.where(spans > 0, spans, 1.0)
         fine, energy, throughput = (means[self.every.index(one)] for one in self.traded)
-        fine = fine if self.fineness.sieve else -fine
+        fine = fine if self.traded[0].sieve else -fine
         better = {"best_energy": _unbeaten(fine, -energy), "best_throughput": _unbeaten(fine, throughput)}
         words = {"long_name": "no other point is finer and better", "units": "1"}
         return result.assign({name: ("sample", flags.astype(np.int8), words) for name, flags in better.items()})
@@ -229,12 +226,10 @@ class _Search:
         """Say which field does not matter to which figure that was asked about; free those that matter to any."""
         said = []
         for k, field in enumerate(self.ends):
-            pairs = []
-            for middle in (0.25, 0.5, 0.75):
-                ends = np.full((2, len(self.ends)), middle)
-                ends[:, k] = 0, 1
-                pairs.append(list(map(self.figures, ends)))
-            same = [one for one in self.asked if all(math.isclose(a[one], b[one], rel_tol=_SAME) for a, b in pairs)]
+            places = np.repeat([[0.25], [0.5], [0.75]], len(self.ends), axis=1)
+            low, high = (np.array([self.figures(place) for place in _with(places, k, end)]) for end in (0, 1))
+            flags = np.isclose(low, high, rtol=_SAME, atol=0).all(axis=0)  # NaN is close to nothing
+            same = [one for one, flag in zip(self.asked, flags, strict=False) if flag]
             if len(same) == len(self.asked):
                 self.free.remove(field)
             if same:
@@ -289,11 +284,11 @@ class _Search:
 
     def reached(self) -> str:
         """Return in words what is reached of each figure that has a bound."""
-        told = []
-        for limit in self.limits:
-            values = [found[limit.quantity] for found in self.known.values()]
-            low, high = (limit.quantity.told(float(end)) for end in (np.nanmin(values), np.nanmax(values)))
-            told.append(f"got {limit}; {low} to {high} is reached")
+        every = np.array(list(self.known.values()))[:, self.bounded]
+        ends = zip(self.limits, np.nanmin(every, axis=0).tolist(), np.nanmax(every, axis=0).tolist(), strict=True)
+        told = [
+            f"got {one}; {one.quantity.told(low)} to {one.quantity.told(high)} is reached" for one, low, high in ends
+        ]
         return "; ".join(told) + (", but not together," if len(told) > 1 else "")
 
     def judged(self, best: np.ndarray) -> dict[str, tuple[float, float]]:
@@ -302,21 +297,27 @@ class _Search:
         runs = self.run(best, range(first, first + self.judges))
         noise = 2 * runs.std(axis=1, ddof=1) / math.sqrt(self.judges) if self.judges > 1 else np.zeros(len(runs))
         steps = _RADIUS * np.vstack([np.eye(best.size), -np.eye(best.size)])
-        here, near = self.figures(best), [self.figures(np.clip(best + step, 0, 1)) for step in steps]
-        errors = [
-            one + max(abs(other[k] - here[k]) for other in near) for k, one in zip(self.every, noise, strict=True)
-        ]
+        moved = np.abs(np.array([self.figures(np.clip(best + step, 0, 1)) for step in steps]) - self.figures(best))
+        errors = noise + np.nanmax(moved, axis=0)
         return {one.words: (float(runs[k].mean()), float(errors[k])) for k, one in enumerate(self.every)}
 
     def binding(self, best: np.ndarray, figures: Mapping[str, tuple[float, float]]) -> list[str]:
         """Return the bounds and ends of ranges that a point lies at."""
-        here = self.figures(best)
-        near = {one: figures[one.words][1] + _RADIUS * self.scales[one] for one in self.every}
-        found = [str(one) for one in self.limits if one.slack(here[one.quantity]) <= near[one.quantity]]
+        near = [
+            figures[one.quantity.words][1] / self.scales[k] for one, k in zip(self.limits, self.bounded, strict=True)
+        ]
+        met = self.slacks(best) - near <= _RADIUS
+        found = [str(one) for one, flag in zip(self.limits, met, strict=True) if flag]
         for field, x in zip(self.ends, best.tolist(), strict=True):
             if field in self.free and not _RADIUS < x < 1 - _RADIUS:
                 found.append(f"{field} at the {'lowest' if x < 0.5 else 'highest'} of its range")
         return found
+
+
+def _with(places: np.ndarray, k: int, value: float) -> np.ndarray:
+    found = places.copy()
+    found[:, k] = value
+    return found
 
 
 def _unbeaten(*figures: np.ndarray) -> np.ndarray:
