@@ -149,7 +149,7 @@ def _limit(name: str, text: str) -> Limit:
 
 
 class _Search:
-    """A search in the unit cube of the ranges; figures, the objective first, are means over replicates, and are kept."""
+    """A search in the unit cube of the ranges; figures, the objective first, are means and are kept."""
 
     def __init__(self, scene: Scene, ends: dict, objective: Quantity, limits: list[Limit], sign: int, seed: int):
         from hpgr.bed.loaded import Beds
@@ -226,8 +226,8 @@ class _Search:
         """Say which field does not matter to which figure that was asked about; free those that matter to any."""
         said = []
         for k, field in enumerate(self.ends):
-            places = np.repeat([[0.25], [0.5], [0.75]], len(self.ends), axis=1)
-            low, high = (np.array([self.figures(place) for place in _with(places, k, end)]) for end in (0, 1))
+            here, places = np.arange(len(self.ends)) == k, np.array([[0.25], [0.5], [0.75]])
+            low, high = (np.array([self.figures(place) for place in np.where(here, end, places)]) for end in (0, 1))
             flags = np.isclose(low, high, rtol=_SAME, atol=0).all(axis=0)  # NaN is close to nothing
             same = [one for one, flag in zip(self.asked, flags, strict=False) if flag]
             if len(same) == len(self.asked):
@@ -312,12 +312,6 @@ class _Search:
             if field in self.free and not _RADIUS < x < 1 - _RADIUS:
                 found.append(f"{field} at the {'lowest' if x < 0.5 else 'highest'} of its range")
         return found
-
-
-def _with(places: np.ndarray, k: int, value: float) -> np.ndarray:
-    found = places.copy()
-    found[:, k] = value
-    return found
 
 
 def _unbeaten(*figures: np.ndarray) -> np.ndarray:
