@@ -20,6 +20,7 @@ import xarray as xr
 from pydantic import ValidationError
 
 from hpgr.fields import show, unit_shown
+from hpgr.fields import values_of as values_in
 from hpgr.laws.feed import Feed
 from hpgr.results import metrics
 from hpgr.results.schema import STATUS
@@ -36,16 +37,7 @@ _MOST_LOST = 10  # lost operating points that the page lists; the others tell wh
 
 
 def page_data(result: xr.Dataset, sieve: float, name: str) -> dict[str, Any]:
-    """Return everything the page of a sweep holds.
-
-    Parameters
-    ----------
-    result : xarray.Dataset
-        From `studies.sweep.sweep`, or read from a file of a study.
-    sieve : float
-        Sieve in m whose percent passing is shown first, within the recorded sieves.
-    name : str
-        What the page calls the sweep.
+    """Return everything the page of a sweep holds; `sieve`, in m, is that whose percent passing is shown first.
 
     Raises
     ------
@@ -68,22 +60,24 @@ def page_data(result: xr.Dataset, sieve: float, name: str) -> dict[str, Any]:
     points = report.operating_points(result)
     feeds, feed_of = feeds_of(result, scene)
     sieved = with_sieve(result, sieve, max((one.largest_grain for one in feeds if one), default=0.0))
-    refuse_too_many(result, sieved.get("sieve"), name)
     sizes = {key: entry(values_of(report.operating_points(sieved), key)) for key in sieved.data_vars}
     shown_sieves = sieved["sieve"].values if sizes else np.array([])
     held = (points["status"] == STATUS["ok"]).sum("replicate").values
+    lost = report.lost_cases(result)
+    figures, across = kpis(points, sieve), profiles(points)
+    refuse_too_many([*figures, *across, *sizes.values()], result, name)
     return {
         "name": name,
-        "told": [line[0].upper() + line[1:] for line in told(result)],
+        "told": [line[0].upper() + line[1:] for line in (*report.remarks(result), *lost[:_MOST_LOST])],
         "made": {key: str(result.attrs[key]) for key in _MADE if key in result.attrs},
         "replicates": result.sizes["replicate"],
         "axes": [axis_data(result, axis, scene) for axis in axes],
         "start": start(result, scene, held),
         "held": held.tolist(),
         "said": [said(points.isel(operating_point=k)) for k in range(points.sizes["operating_point"])],
-        "kpis": kpis(points, sieve),
+        "kpis": figures,
         "streamlines": numbers(result["xi"].values) if "xi" in result else [],
-        "profiles": profiles(points),
+        "profiles": across,
         "sieves": numbers(shown_sieves * 1e3),
         "sieve": int(np.argmin(np.abs(shown_sieves - sieve))) if sizes else 0,
         "passing": sizes,
@@ -91,13 +85,6 @@ def page_data(result: xr.Dataset, sieve: float, name: str) -> dict[str, Any]:
         "feed_of": feed_of,
         "scene": json.loads(result.attrs["scene"]),
     }
-
-
-def told(result: xr.Dataset) -> list[str]:
-    """Return what a page says of the whole sweep: its remark, limits, lost cases."""
-    lost = report.lost_cases(result)
-    more = [f"and {len(lost) - _MOST_LOST} more lost operating points"] if len(lost) > _MOST_LOST else []
-    return report.remarks(result) + lost[:_MOST_LOST] + more
 
 
 def require_sweep(result: xr.Dataset, name: str) -> None:
@@ -114,18 +101,13 @@ def require_sweep(result: xr.Dataset, name: str) -> None:
         raise ValueError(f"{name}: no case holds a result, so there is nothing to show; the first: {lines[0]}")
 
 
-def refuse_too_many(result: xr.Dataset, sieves: xr.DataArray | None, name: str) -> None:
-    """Raise ValueError if a page would hold more than `MOST_NUMBERS` numbers."""
-    points = math.prod(result.sizes[axis] for axis in report.axes_of(result))
-    across = sum("streamline" in value.dims for value in result.data_vars.values())
-    each = len(result.data_vars) + across * result.sizes.get("streamline", 0)
-    if sieves is not None:
-        each += sieves.size * (1 + (result.sizes.get("streamline", 0) if "passing" in result else 0))
-    if 2 * points * each > MOST_NUMBERS:
+def refuse_too_many(entries: list[dict[str, Any]], result: xr.Dataset, name: str) -> None:
+    """Raise ValueError if means and spreads are more than `MOST_NUMBERS` numbers."""
+    total = sum(len(one["mean"]) + len(one["sd"]) for one in entries)
+    if total > MOST_NUMBERS:
         axis = max(report.axes_of(result), key=lambda one: result.sizes[one])
         raise ValueError(
-            f"{name}: {points} operating points of {each} means and spreads are {2 * points * each:.2g} numbers; "
-            f"a page holds at most {MOST_NUMBERS:.2g}, here {MOST_NUMBERS // (2 * each)} operating points; "
+            f"{name}: its means and spreads are {total:.2g} numbers; a page holds at most {MOST_NUMBERS:.2g}; "
             f'show a part: xarray.open_dataset("{name}").isel({axis}=slice(None, None, 2)).to_netcdf("part.nc")'
         )
 
@@ -147,15 +129,7 @@ def entry(values: xr.DataArray) -> dict[str, list]:
 
 
 def numbers(values: np.ndarray, digits: int = DIGITS) -> list:
-    """Return an array flat, rounded to significant digits, whole numbers short, None for NaN.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from studies.show.page import numbers
-    >>> numbers(np.array([0.123456789, 3.0, np.nan]))
-    [0.123457, 3, None]
-    """
+    """Return an array flat, rounded to significant digits, whole numbers short, None for NaN."""
     return [_short(value, digits) for value in np.asarray(values, float).ravel().tolist()]
 
 
@@ -215,7 +189,7 @@ def with_sieve(result: xr.Dataset, sieve: float, largest: float) -> xr.Dataset:
     """
     kept = result[[name for name in ("passing_total", "passing") if name in result]]
     if not kept.data_vars:
-        return kept.drop_vars("sieve", errors="ignore")
+        return kept
     known = kept["sieve"].values
     if not known[0] <= sieve <= known[-1]:
         raise ValueError(
@@ -278,24 +252,19 @@ def changes(scene: Scene, values: dict[str, Any]) -> dict[str, Any]:
 
 def start(result: xr.Dataset, scene: Scene, held: np.ndarray) -> list[int]:
     """Return the places on the axes of the operating point shown first: the scene's own, or the next with a result."""
-    shape = [result.sizes[name] for name in report.axes_of(result)]
-    if not shape:
-        return []
-    axes = (result[name] for name in report.axes_of(result))
+    axes = [result[name] for name in report.axes_of(result)]
     own = [_nearest(axis, scene) if report.is_field(axis) else 0 for axis in axes]
-    full = np.argwhere(held.reshape(shape) > 0)
+    full = np.argwhere(held.reshape([axis.size for axis in axes]) > 0)
     return full[np.argmin(np.abs(full - own).sum(axis=1))].tolist()
 
 
 def _nearest(axis: xr.DataArray, scene: Scene) -> int:
-    section, _, key = axis.attrs["scene_field"].partition(".")
-    own = getattr(getattr(scene, section), key, None)
-    values = axis.values
-    if axis.dtype.kind in "fiu":
-        if own is None or not math.isfinite(own):
-            return axis.size // 2
-        return int(np.argmin(np.abs(np.nan_to_num(values.astype(float)) - own)))
-    return int(np.argmax(values == own))  # the first, if it is none of them
+    own = values_in(scene).get(axis.attrs["scene_field"])
+    if axis.dtype.kind not in "fiu":
+        return int(np.argmax(axis.values == own))  # the first, if it is none of them
+    if own is None or not math.isfinite(own):
+        return axis.size // 2
+    return int(np.argmin(np.abs(np.nan_to_num(axis.values.astype(float)) - own)))
 
 
 def feeds_of(result: xr.Dataset, scene: Scene) -> tuple[list[Feed | None], list[int]]:
