@@ -166,6 +166,17 @@ def test_what_is_put_is_found_after_a_flush(tmp_path, monkeypatch):
     assert back.summary["throughput"] == 2
 
 
+def test_what_an_idle_driver_holds_comes_to_disk(tmp_path, monkeypatch):
+    """Two drivers that each wait for the other's last cases would otherwise wait for ever."""
+    monkeypatch.setattr(cases, "_FLUSH_SECONDS", 1e9)
+    with CaseFolder(tmp_path) as one, CaseFolder(tmp_path) as other:
+        one.put(A, result(1))
+        assert addresses(tmp_path) == []
+        monkeypatch.setattr(cases, "_FLUSH_SECONDS", -1.0)
+        assert list(one.read(B.__eq__)) == []
+        assert [found.address for found in other.read(A.__eq__)] == [A]
+
+
 def test_newest_record_wins(tmp_path):
     with CaseFolder(tmp_path) as kept:
         for number in (1, 2):

@@ -328,8 +328,10 @@ class CaseFolder:
     def read(self, wanted: Callable[[str], bool]) -> Iterator[Found]:
         """Yield the records of wanted addresses that were not read before; cheap if the folder has not changed.
 
-        Called again and again, this is also the driver's sign of life.
+        Called again and again, this is also the driver's sign of life, and puts on disk what others may wait for.
         """
+        if time.monotonic() - self._flushed > _FLUSH_SECONDS:
+            self.flush()
         if time.monotonic() - self._signed > _SIGN_SECONDS:
             self._signed = time.monotonic()
             os.utime(self._sign)
