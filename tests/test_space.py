@@ -9,6 +9,7 @@ import hpgr
 from hpgr.results.schema import STATUS
 from studies import open_cases
 from studies.command import varied
+from studies.gap_sweep import main
 from studies.show import page, report
 from studies.show.plots import maps
 from studies.sweep import netcdf, sweep
@@ -191,3 +192,41 @@ def test_two_axes_of_numbers_make_a_map(base, client):
     assert "words" in figure.get_supxlabel()
     fineness = np.concatenate([part.get_array() for part in figure.axes[0].collections if part.get_array() is not None])
     assert np.ptp(fineness) > 1
+
+
+def test_command_line_of_a_space(capsys):
+    """Scenes, a grid and a design make one space; what does not fit together is refused."""
+    tiny = ["--dry-run", "--replicates", "1", "--cells", "20", "--points", "20", "--streamlines", "2"]
+    design = ["--vary", "gap=50 mm..60 mm", "--vary", "roll_speed=15 rpm..19 rpm", "--sample", "4"]
+    assert main([*tiny, *design, "--vary", "cushioning=0.5,inf", "--scene", "paper", "industrial"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    headings = "scene sample gap [mm] roll speed [rpm] strength cushioning memory time"
+    assert " ".join(lines[2].split()) == headings
+    assert sum("inf" in line for line in lines) == 8
+    assert any(line.startswith("16 cases") for line in lines)
+    assert main([*tiny, "--vary", "feed.top_size=40 mm..60 mm:3"]) == 0  # beside the study's own axis
+    assert "18 cases" in capsys.readouterr().out
+    for given, words in {
+        ("--vary", "gap=50 mm..60 mm"): "--sample go together",
+        ("--sample", "4"): "--sample go together",
+        ("--gap", "50 mm", "--vary", "gap=60 mm"): "twice",
+        ("--vary", "press_force=3 MPa", "--gap", "50 mm"): "gap floats",
+        ("--scene", "paper", "paper"): "different names",
+    }.items():
+        assert main([*tiny, *given]) == 2
+        assert words in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_command_line_draws_a_design_and_compares_scenes(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    tiny = ["--replicates", "1", "--cells", "20", "--points", "20", "--streamlines", "2"]
+    design = ["--vary", "gap=50 mm..60 mm", "--vary", "roll_speed=15 rpm..19 rpm", "--sample", "4"]
+    assert main([*tiny, *design]) == 0
+    assert "4 cases to compute" in capsys.readouterr().err
+    assert main([*tiny, *design]) == 0
+    assert "4 of 4 cases read back" in capsys.readouterr().err
+    both = [*tiny, "--gap", "50 mm", "--scene", "paper", "industrial", "--out", "both"]
+    assert main(both) == 0
+    assert main([*both[:-2], "khd_pilot", "--out", "both"]) == 2  # the file is of other scenes
+    assert "result of another command" in capsys.readouterr().err
