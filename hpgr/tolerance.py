@@ -32,19 +32,11 @@ _SAFETY = 1.5  # on differences that stand for a bias
 
 
 class Estimate(NamedTuple):
-    """A resolution and the error estimated for it.
+    """A resolution and the error estimated for it."""
 
-    Attributes
-    ----------
-    scene : Scene
-        The scene at the chosen resolution.
-    bias, noise : dict
-        By quantity, relative: what is left of bias, and one standard error.
-    """
-
-    scene: Scene
-    bias: dict[str, float]
-    noise: dict[str, float]
+    scene: Scene  # at the chosen resolution
+    bias: dict[str, float]  # what is left of it, by quantity, relative
+    noise: dict[str, float]  # one standard error, likewise
 
     def errors(self) -> dict[str, float]:
         """Return bias + 2 standard errors by quantity, relative."""

@@ -26,6 +26,11 @@ class Run(NamedTuple):
     performance: Performance
     crushed: Crushed | None
 
+    @property
+    def broken(self) -> bool | None:
+        """Whether any grain broke; None where there are none."""
+        return None if self.crushed is None else bool(self.crushed.breaks.any())
+
 
 class Flag(NamedTuple):
     """A limit."""
@@ -33,7 +38,7 @@ class Flag(NamedTuple):
     name: str
     bit: int  # of the variable `flags`
     meaning: str  # what it says of any run
-    words: Callable[[Run], str]  # returns a sentence with the figures of a run that hit it, and nothing for others
+    hit: Callable[[Run], bool | str]  # whether a run hit it, or a sentence with its figures
 
 
 class Usual(NamedTuple):
@@ -64,8 +69,8 @@ USUAL = {
 def diagnose(scene: Scene, bed: LoadedBed, performance: Performance, crushed: Crushed | None) -> dict[str, str]:
     """Return, by flag, a sentence for each limit that a run hit."""
     run = Run(scene, bed, performance, crushed)
-    told = ((flag.name, flag.words(run)) for flag in FLAGS)
-    return {name: words for name, words in told if words}
+    told = ((flag, flag.hit(run)) for flag in FLAGS)
+    return {flag.name: words if isinstance(words, str) else flag.meaning for flag, words in told if words}
 
 
 def names(bits: int) -> list[str]:
@@ -132,30 +137,23 @@ def _single_particle_nipping(run: Run) -> str:
     return words if gaps > _NIPPING else ""
 
 
-def _tension_clamped(run: Run) -> str:
-    words = "the elastic law asked for tension or reverse shear; stresses were held at 0 there"
-    return words if run.bed.stress.tension_clamped else ""
-
-
 def _no_limit_of_steps(run: Run) -> str:
     exponent = values_of(run.scene.elasticity).get("exponent", 0.0)
     words = f"with elasticity.exponent {exponent:g}, below 0, stresses need not converge as time steps shrink"
     return words if exponent < 0 and run.bed.stress.pressure.any() else ""
 
 
-def _no_force_angle(run: Run) -> str:
-    words = "the bed takes more power than the force can give at any angle; force_angle is 90 deg"
-    return words if run.performance.force_angle >= np.pi / 2 else ""
+def _no_force_angle(run: Run) -> bool:
+    return run.performance.force_angle >= np.pi / 2
 
 
-def _no_breakage(run: Run) -> str:
-    unbroken = run.crushed is not None and not run.crushed.breaks.any()
-    return "no grain broke: the product is the feed" if unbroken else ""
+def _few_cells(run: Run) -> bool:
+    return run.scene.resolution.cells in (2, 3)
 
 
 def _feed_below_critical(run: Run) -> str:
     scattered = math.isfinite(values_of(run.scene.strength).get("scatter", math.inf))
-    if run.crushed is None or not run.crushed.breaks.any() or scattered:
+    if not run.broken or scattered:
         return ""
     critical = _critical_size(run)
     share = float(run.scene.feed.passing(np.nextafter(critical, 0.0)))
@@ -185,24 +183,19 @@ def _size_floor_reached(run: Run) -> str:
     return f"{run.crushed.below_floor.mean():.3g} of the product is below the size floor, where nothing breaks"
 
 
-def _few_cells(run: Run) -> str:
-    few = run.scene.resolution.cells in (2, 3)
-    return "with 2 or 3 cells every cell neighbours every other; use more" if few else ""
-
-
 FLAGS = (  # in the order in which they are told
     Flag("unusual_machine", 128, "machine, ore or operation outside usual ranges", _unusual_machine),
     Flag("no_compaction", 2, "nothing is compacted: the product is the feed", _no_compaction),
     Flag("solid_fraction_capped", 4, "mass continuity would need a denser cake", _solid_fraction_capped),
     Flag("single_particle_nipping", 8, f"the feed's top size is above {_NIPPING:g} gaps", _single_particle_nipping),
-    Flag("tension_clamped", 64, "the elastic law asked for tension or reverse shear", _tension_clamped),
+    Flag("tension_clamped", 64, "tension or reverse shear was held at 0", lambda run: run.bed.stress.tension_clamped),
     Flag("no_limit_of_steps", 512, "stresses need not converge as time steps shrink", _no_limit_of_steps),
     Flag("no_force_angle", 256, "more power than the force can give at any angle", _no_force_angle),
-    Flag("no_breakage", 1, "no grain broke: the product is the feed", _no_breakage),
+    Flag("no_breakage", 1, "no grain broke: the product is the feed", lambda run: run.broken is False),
     Flag("feed_below_critical", 1024, "part of the feed is finer than any stress breaks", _feed_below_critical),
     Flag("fragment_exponent_held", 2048, "the exponent of fragments left its range", _fragment_exponent_held),
     Flag("size_floor_reached", 16, "part of the product is below the size floor", _size_floor_reached),
-    Flag("few_cells", 32, "with 2 or 3 cells every cell neighbours every other", _few_cells),
+    Flag("few_cells", 32, "of 2 or 3 cells each neighbours every other; use more", _few_cells),
 )
 BITS = {flag.name: flag.bit for flag in sorted(FLAGS, key=lambda flag: flag.bit)}
 ATTRIBUTES = {"flag_masks": np.array(list(BITS.values()), np.int32), "flag_meanings": " ".join(BITS)}

@@ -11,8 +11,6 @@ from hpgr.fields import parse
 from hpgr.results.schema import Variable
 from hpgr.scene import Scene
 
-_PASSING = Variable((), "1", "mass fraction passing")
-
 
 def passing(dataset: xr.Dataset, sieves=None, point: int = -1, total: bool = False) -> xr.DataArray:
     """Return the mass fraction passing `sieves` at a material point, snapshots of the steady machine pooled.
@@ -56,7 +54,7 @@ def passing(dataset: xr.Dataset, sieves=None, point: int = -1, total: bool = Fal
     else:
         found = _recorded_passing(dataset, point)
         found = found if sieves is None else between_sieves(found, wanted)
-    found.attrs = _PASSING.attributes()
+    found.attrs = Variable((), "1", "mass fraction passing").attributes()
     found = found.rename("passing")
     return found.mean("streamline", keep_attrs=True) if total else found
 
@@ -161,15 +159,7 @@ def reduction_ratio(dataset: xr.Dataset, percent: float = 80, total: bool = Fals
 
 
 def gap_throughput(scene: Scene, exit_solid_fraction: float) -> float:
-    """Return the solids through the whole gap, Q = rho_s phi_exit s_b L U, kg/s.
-
-    Examples
-    --------
-    >>> import hpgr
-    >>> from hpgr.results import metrics
-    >>> round(metrics.gap_throughput(hpgr.presets.paper(), exit_solid_fraction=0.9), 1)  # kg/s
-    854.2
-    """
+    """Return the solids through the whole gap, Q = rho_s phi_exit s_b L U, kg/s."""
     rolls = scene.rolls
     return scene.bed.solid_density * exit_solid_fraction * rolls.gap * rolls.width * rolls.surface_speed
 
@@ -228,13 +218,8 @@ def _recorded_passing(dataset: xr.Dataset, point: int) -> xr.DataArray:
             f"point: got {point}; only the exit (-1) is recorded; "
             "simulate with resolution.record 'distributions' or 'cells'"
         )
-    return (
-        _steady(dataset["mass_fraction"])
-        .isel(point=point)
-        .mean("time")
-        .cumsum("sieve")
-        .assign_coords(sieve=dataset["sieve"])
-    )
+    mean = _steady(dataset["mass_fraction"]).isel(point=point).mean("time")
+    return mean.cumsum("sieve").assign_coords(sieve=dataset["sieve"])
 
 
 def between_sieves(found: xr.DataArray, wanted: np.ndarray) -> xr.DataArray:
@@ -244,15 +229,6 @@ def between_sieves(found: xr.DataArray, wanted: np.ndarray) -> xr.DataArray:
     ------
     ValueError
         If a size lies outside the recorded sieves.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import xarray as xr
-    >>> from hpgr.results import metrics
-    >>> found = xr.DataArray([0.2, 0.6], {"sieve": [1e-3, 4e-3]}, "sieve")
-    >>> metrics.between_sieves(found, np.array([2e-3])).values.round(3)
-    array([0.4])
     """
     known = found["sieve"].values
     outside = wanted[(wanted < known[0]) | (wanted > known[-1])]
@@ -283,8 +259,7 @@ def _percentile_between_sieves(found: xr.DataArray, fraction: float, total: bool
                 f"{100 * fractions[0]:.3g} to {100 * fractions[-1]:.3g} %; extend resolution.sieves, or record 'cells'"
             )
         first = int(np.searchsorted(fractions, fraction))  # the finest sieve that passes it
-        if first == 0 or fractions[first] == fraction:
-            return np.exp(log_sieves[first])
-        return np.exp(np.interp(fraction, fractions[first - 1 : first + 1], log_sieves[first - 1 : first + 1]))
+        around = slice(max(first - 1, 0), first + 1)
+        return np.exp(np.interp(fraction, fractions[around], log_sieves[around]))
 
     return xr.apply_ufunc(invert, found, input_core_dims=[["sieve"]], vectorize=True)
