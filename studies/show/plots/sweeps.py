@@ -96,8 +96,8 @@ def _products(panels, result: xr.Dataset, sieve: float) -> bool:
         (("p80", "Product size", "P80 [mm]"), ("passing", "Fineness", f"below {show(sieve, 'm')} [%]")),
         strict=False,
     ):
-        _across_half_gap(panel, across[name].isel(operating_point=chosen), result["xi"].values, named)
-        panel.set(title=f"{title} from mid-gap to the roll", ylabel=unit)
+        flat = _across_half_gap(panel, across[name].isel(operating_point=chosen), result["xi"].values, named)
+        panel.set(title=f"{title} to the roll" + (", flat within its noise" if flat else ""), ylabel=unit)
     handles, names = panels[0].get_legend_handles_labels()
     place = {"loc": "outside upper center", "ncols": len(names), "fontsize": 9, "frameon": False}
     panels[0].figure.legend(handles, names, title=_title(result), **place)
@@ -105,8 +105,8 @@ def _products(panels, result: xr.Dataset, sieve: float) -> bool:
     return thinned
 
 
-def _across_half_gap(panel, values: xr.DataArray, xi: np.ndarray, labels: list[str]) -> None:
-    """Draw a figure of every stream tube where it was measured, and say if it is flat within its noise."""
+def _across_half_gap(panel, values: xr.DataArray, xi: np.ndarray, labels: list[str]) -> bool:
+    """Draw a figure of every stream tube where it was measured; return whether it is flat within its noise."""
     flat = True
     for k, label in enumerate(labels):
         one = values.isel(operating_point=k)
@@ -114,11 +114,10 @@ def _across_half_gap(panel, values: xr.DataArray, xi: np.ndarray, labels: list[s
         known = not np.isnan(bars).all()
         panel.errorbar(xi, mean, bars if known else None, label=label, **_style(k, len(labels)))
         flat &= known and bool((np.abs(mean - mean.mean()) <= 2 * bars.max() / np.sqrt(one.sizes["replicate"])).all())
-    if flat:
-        panel.text(0.5, 0.03, "flat within its noise", ha="center", transform=panel.transAxes, fontsize=9)
     panel.set(xlabel="distance from mid-gap [half gaps]", xlim=(0, 1))
     panel.axvline(1, color="0.3", linewidth=3)  # the roll
     panel.grid(color="0.9")
+    return flat
 
 
 def _product_sizes(panel, points: xr.Dataset, feed) -> None:
