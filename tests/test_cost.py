@@ -35,15 +35,6 @@ def test_cost_grows_with_every_size(name):
     assert large.seconds > small.seconds
 
 
-def test_what_is_not_recorded_costs_less():
-    costs = [
-        cost.predict(paper({"resolution.cells": 10_000, "resolution.record": record})).bytes
-        for record in ("product", "distributions", "cells")
-    ]
-    assert costs == sorted(costs)
-    assert cost.predict(paper({"resolution.cells": 0})).bytes < costs[0]
-
-
 def test_scene_beyond_the_memory_is_refused_with_bytes_bound_and_remedy(monkeypatch):
     scene = paper()
     needed = cost.predict(scene).bytes
