@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from pydantic import ValidationError
 
-from hpgr import cost
 from studies import command as cli
 from studies.guard import maps, ranges
 from studies.guard.judge import KINDS, Outcome, as_wanted, base, catalogue, hosts, judge
@@ -119,8 +118,10 @@ def _pairs(known: Mapping[str, ranges.Range]) -> Iterator[tuple[str, dict[str, A
 
 
 def _cheap(values: dict[str, Any]) -> bool:
+    from hpgr.cost import predict
+
     try:
-        return cost.predict(base(hosts(values)[0])).seconds < _PAIR_SECONDS
+        return predict(base(hosts(values)[0])).seconds < _PAIR_SECONDS
     except ValidationError:
         return True  # refused alone, and at no cost
 

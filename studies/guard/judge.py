@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
-from hpgr import cost, presets
+from hpgr import presets
 from hpgr.fields import kinds_of
 from hpgr.scene import Scene
 from studies.guard import ranges
@@ -82,6 +82,7 @@ def judge(values: Mapping[str, Any], seed: int = 0) -> Outcome:
 
 def _run(scene: Scene, seed: int) -> Outcome:
     import hpgr
+    from hpgr import cost
     from hpgr.results import flags
     from studies.guard import invariants
 
