@@ -8,29 +8,15 @@ settings.load_profile("house")
 
 # rooms of studies/ whose tests run processes, files, pages and clusters around the same few kernels; CI's run without
 # the compiler, which takes coverage of hpgr, leaves them out
-PLUMBING = {
-    "test_accuracy",
-    "test_cases",
-    "test_cf",
-    "test_cluster",
-    "test_command_lines",
-    "test_docs",
-    "test_explore",
-    "test_netcdf",
-    "test_paper",
-    "test_pictures",
-    "test_pilot",
-    "test_plots",
-    "test_ready",
-    "test_recorded",
-    "test_report",
-    "test_resume",
-}
+PLUMBING = (
+    "accuracy cases cf cluster command_lines docs explore netcdf optimum paper pictures pilot plots ready recorded "
+    "report resume sensitivity space"
+)
 
 
 def pytest_collection_modifyitems(items):
     for item in items:
-        if item.module.__name__ in PLUMBING:
+        if item.module.__name__.removeprefix("test_") in PLUMBING.split():
             item.add_marker(pytest.mark.plumbing)
 
 

@@ -75,18 +75,8 @@ def cluster(tmp_path_factory):
     worker = [*common, "--nthreads", "1", "--local-directory", str(cwd), "--death-timeout", "60"]
     plain = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     with contextlib.ExitStack() as stack:
-        scheduler = stack.enter_context(
-            process(
-                "distributed.cli.dask_scheduler",
-                *common,
-                "--port",
-                "0",
-                "--scheduler-file",
-                str(file),
-                cwd=cwd,
-                env=plain,
-            )
-        )
+        asked = f"--port 0 --scheduler-file {file}".split()
+        scheduler = stack.enter_context(process("distributed.cli.dask_scheduler", *common, *asked, cwd=cwd, env=plain))
         deadline = time.monotonic() + 120
         address = None
         while address is None:
@@ -186,17 +176,11 @@ def test_dask_jobqueue(base, tmp_path, monkeypatch):
 
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
     monkeypatch.setenv("PYTHONWARNINGS", "ignore")
+    job = {"cores": 1, "processes": 1, "memory": "2GB", "python": sys.executable}
+    loopback = {"worker_extra_args": ["--host", "127.0.0.1"]}
+    loopback["scheduler_options"] = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
     with (
-        jobqueue.LocalCluster(
-            cores=1,
-            processes=1,
-            memory="2GB",
-            python=sys.executable,
-            interface=None,
-            local_directory=str(tmp_path),
-            scheduler_options={"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"},
-            worker_extra_args=["--host", "127.0.0.1"],
-        ) as cluster,
+        jobqueue.LocalCluster(**job, local_directory=str(tmp_path), interface=None, **loopback) as cluster,
         Client(cluster, set_as_default=False) as client,
     ):
         cluster.scale(jobs=2)

@@ -134,7 +134,7 @@ def test_manifest_that_is_damaged_or_somebody_elses_is_refused(base, client, tmp
 
     def forged(**values):
         sweep = told["sweep"] | values
-        return json.dumps({"format": 2, "checksum": assemble._checksum(sweep), "sweep": sweep})
+        return json.dumps({"format": assemble._FORMAT, "checksum": assemble._checksum(sweep), "sweep": sweep})
 
     outside = forged(addresses=["../" * 10 + "etc/passwd"])
     for text in ("{", "[" * 200_000, '{"format": 99}', "3", outside, forged(addresses=[3]), forged(addresses=3)):
