@@ -79,7 +79,7 @@ def _cells(panel, level: np.ndarray, shades, texts: np.ndarray, dark: int) -> No
     panel.imshow(level.T, origin="lower", aspect="auto", **style)
     for i, j in np.ndindex(level.shape):
         ink = "white" if level[i, j] >= dark else "black"
-        panel.text(i, j, texts[i, j], ha="center", va="center", fontsize=7.5, color=ink, linespacing=0.95)
+        panel.text(i, j, texts[i, j], ha="center", va="center", fontsize=7.5, color=ink, linespacing=1.1)
     panel.set_xticks(np.arange(level.shape[0] + 1) - 0.5, minor=True)
     panel.set_yticks(np.arange(level.shape[1] + 1) - 0.5, minor=True)
     panel.grid(which="minor", color="0.5", linewidth=0.5)
@@ -105,7 +105,7 @@ def integrators(result: xr.Dataset) -> Figure:
         one = result.sel(integrator=integrator)
         error, tension, settled = (one[f"integrator_{part}"].values for part in ("error", "tension", "settled"))
         level = np.clip(np.searchsorted(_ERROR_LEVELS, error, side="right") - 1, 0, len(_ERROR_SHADES) - 1)
-        told = np.where(settled == 1, [[f"{100 * e:.2g}\n" for e in row] for row in error], "no limit\n")
+        told = np.where(settled == 1, [[f"{100 * e:.1f}\n" for e in row] for row in error], "no limit\n")
         texts = np.char.add(told, np.where(tension == 1, "T", ""))
         _cells(panel, np.where(settled == 1, level, 0), _ERROR_SHADES, texts, dark=4)
         panel.set_xticks(np.arange(level.shape[0]), [f"{c:g}" for c in one["exponent"].values])
