@@ -12,19 +12,18 @@ SI in and out; size distributions are fractions passing on the sieves of a `Pilo
 coarse to fine: between the sieves, and below the finest.
 """
 
-import difflib
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import optimize
 
 from hpgr.laws.flow import cake_nip_angle, densest_ratio
+from hpgr.scene import Scene
 from hpgr.tables import PilotTest
 
 PRODUCTS = ("centre", "edge", "total")
-_CHOICES = {"opening": ("cake_thickness", "gap"), "force": ("hydraulic_pressure", "specific_pressing_force")}
 _EVALUATIONS = 150  # per start, without those for derivatives; the pilot tests take 10 to 35
 _LOGARITHMIC = {"selection", "rate"}  # fitted by their logarithm
 
@@ -88,18 +87,18 @@ class TorresCasaliModel(NamedTuple):
 
     machine: Machine
     reference_size: float  # x_1, m
-    blocks: int
-    opening: str
-    force: str
+    opening: str = "cake_thickness"  # which thickness holds the cake density; the model has no equation for either
+    force: str = "hydraulic_pressure"  # the published F = R_p (D/2) L; or "specific_pressing_force", F = Fsp D L
+    blocks: int = 10
 
     def predict(self, parameters: TorresCasali, test: PilotTest) -> Prediction:
-        """Return products, throughput, power and specific energy of `test`.
+        """Return products, throughput, power and specific energy of `test`, from its feed, speed, opening and force.
 
-        Of the test its sieves, feed, speed, opening and force are taken, nothing that was measured of
-        product, throughput or power. The published model has no equation for the gap either: the
-        opening, cake thickness or working gap, is the one measured.
+        Every feed is treated as fed to the particle bed: single particles nipped above it are not modelled.
         """
-        _refuse(self.faults(test))
+        for name in (self.opening, self.force):
+            if math.isnan(getattr(test, name)):
+                raise ValueError(f"test {test.name}, {name}: not measured; the model needs it; measure it")
         rolls, opening, speed = self.machine, getattr(test, self.opening), test.surface_speed
         if self.force == "hydraulic_pressure":
             newtons = test.hydraulic_pressure * rolls.diameter / 2 * rolls.width  # printed 100 R_p (D/2) L, bar and kN
@@ -111,19 +110,6 @@ class TorresCasaliModel(NamedTuple):
         masses = block_products(parameters, test.sizes, test.feed, energies, self.reference_size)
         passing = {name: np.cumsum(part[::-1]) for name, part in combine(masses, parameters.edge_share).items()}
         return Prediction(test.sizes, **passing, throughput=flow, power=watts, specific_energy=watts / flow)
-
-    def faults(self, test: PilotTest) -> list[str]:
-        """Return what the model needs of a test and was not measured."""
-        found = []
-        for role, fields in _CHOICES.items():
-            field = getattr(self, role)
-            other = next(name for name in fields if name != field)
-            if field not in fields:
-                found.append(f"{role}: got {field!r}; must be one of {', '.join(fields)}; such as {role}={other!r}")
-            elif math.isnan(getattr(test, field)):
-                need = "not measured; the model needs it; measure it"
-                found.append(f"test {test.name}, {field}: {need} or pass {role}={other!r}")
-        return found
 
 
 class HindeKalalaModel(NamedTuple):
@@ -157,8 +143,7 @@ class Fit(NamedTuple):
     model: TorresCasaliModel | HindeKalalaModel
     parameters: TorresCasali | HindeKalala
     rmse: float  # of the fit, percent passing over all measured curves
-    at_bounds: tuple[str, ...]  # fitted parameters that stopped at the end of their range
-    settled: bool  # False if the search ran out of evaluations before it came to rest
+    constants: tuple[str, ...]  # parameters that were fitted
 
     def predict(self, test: PilotTest) -> Prediction:
         """Return what the model says of a test."""
@@ -169,7 +154,7 @@ class _Search(NamedTuple):
     low: Any  # lowest and highest value that a fit may take
     high: Any
     starts: tuple  # the published porphyry first; the others around it
-    of_edges: set[str]  # parameters that the total alone does not tell
+    of_edges: dict[str, float]  # parameters that the total alone does not tell, and their usual values
 
 
 _SEARCHES = {
@@ -182,7 +167,7 @@ _SEARCHES = {
             TorresCasali(0.70, 0.60, 5.0, 2.0 / 3600, 0.5, 0.0, 0.2),
             TorresCasali(0.10, 0.30, 1.5, 0.5 / 3600, -1.0, -0.3, 0.3),
         ),
-        {"edge_share"},
+        {"edge_share": 0.2},
     ),
     HindeKalala: _Search(
         HindeKalala(1e-7, 0.01, 0.0, 0.1, 0.01, 0.01),
@@ -192,106 +177,106 @@ _SEARCHES = {
             HindeKalala(5.0 / 3600, 0.6, 0.9, 3.0, 0.15, 0.3),
             HindeKalala(0.5 / 3600, 0.8, 0.1, 1.5, 0.3, 0.8),
         ),
-        {"edge_share", "edge_energy"},
+        {"edge_share": 0.2, "edge_energy": 0.5},
     ),
 }
 
 
-def fit_torres_casali(
-    tests: Sequence[PilotTest],
-    machine: Machine,
-    fixed: Mapping[str, float] | None = None,
-    *,
-    blocks: int = 10,
-    opening: Literal["cake_thickness", "gap"] = "cake_thickness",
-    force: Literal["hydraulic_pressure", "specific_pressing_force"] = "hydraulic_pressure",
-) -> Fit:
+def fit_torres_casali(tests: Sequence[PilotTest], scene: Scene) -> Fit:
     """Fit the Torres & Casali model to the measured size distributions of `tests` by least squares.
 
-    Every feed is treated as fed to the particle bed: single particles nipped above it are not modelled.
-
-    Parameters
-    ----------
-    fixed
-        Parameters of `TorresCasali`, by name, that are not fitted.
-    blocks
-        Number of blocks across the roll width.
-    opening
-        Which measured thickness holds the cake density: the flake's or the working gap.
-    force
-        "hydraulic_pressure" for the published F = R_p (D/2) L; "specific_pressing_force" for F = Fsp D L.
+    Rolls and densities are the scene's, or the first test's where it tells them; the cake's density is that of the
+    throughput through the measured opening. The force is the hydraulic pressure's where that was measured.
 
     Raises
     ------
     ValueError
-        If tests, machine or fixed parameters cannot be fitted: one error that lists every fault.
+        If there are no tests, or a test has no opening.
 
     Examples
     --------
     >>> import hpgr
+    >>> from hpgr.baselines import fit_torres_casali
     >>> from hpgr.tables import read_pilot_tests
-    >>> from hpgr.baselines import Machine, TorresCasali, fit_torres_casali
     >>> folder = hpgr.presets.DATA
     >>> tests = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
-    >>> published = TorresCasali(0.20, 0.20, 3.51, 0.66 / 3600, -1.26, -0.70, 0.22)._asdict()
-    >>> fixed = {name: value for name, value in published.items() if name != "selection"}
-    >>> found = fit_torres_casali(tests[:1], Machine(0.8, 0.25, 2740.0, 1630.0, 2300.0), fixed)
-    >>> found.settled, found.at_bounds
-    (True, ())
+    >>> found = fit_torres_casali(tests[:1], hpgr.presets.khd_pilot())
+    >>> round(found.predict(tests[0]).throughput * 3.6, 1)  # t/h
+    32.9
     """
-    fixed = dict(fixed or {})
-    reference = max((coarsest_class(test.sizes) for test in tests), default=math.nan)
-    model = TorresCasaliModel(machine, reference, blocks, opening, force)
-    faults = [*_machine_faults(machine), *_fit_faults(tests, TorresCasali, fixed)]
-    faults += [fault for test in tests for fault in model.faults(test)]
-    if blocks < 1:
-        faults.append(f"blocks: got {blocks}; must be at least 1; use about 10")
-    _refuse(faults)
-    return _least_squares(model, tests, TorresCasali, fixed)
+    _refuse_none(tests)
+    opening = "gap" if any(math.isnan(test.cake_thickness) for test in tests) else "cake_thickness"
+    pressed = all(math.isfinite(test.hydraulic_pressure) for test in tests)
+    model = TorresCasaliModel(
+        _machine_of(tests, scene, opening),
+        max(coarsest_class(test.sizes) for test in tests),
+        opening,
+        "hydraulic_pressure" if pressed else "specific_pressing_force",
+    )
+    return _least_squares(model, tests, TorresCasali)
 
 
-def fit_hinde_kalala(tests: Sequence[PilotTest], fixed: Mapping[str, float] | None = None) -> Fit:
+def _machine_of(tests: Sequence[PilotTest], scene: Scene, opening: str) -> Machine:
+    rolls, bed, first = scene.rolls, scene.bed, tests[0]
+    diameter, width, solid = (
+        own if math.isnan(told) else told
+        for own, told in (
+            (rolls.diameter, first.diameter), (rolls.width, first.width), (bed.solid_density, first.solid_density),
+        )
+    )  # fmt: skip
+    cakes = [test.throughput / (getattr(test, opening) * width * test.surface_speed) for test in tests]
+    known = [cake for cake in cakes if math.isfinite(cake)]
+    cake = sum(known) / len(known) if known else 0.85 * solid
+    return Machine(diameter, width, solid, solid * bed.feed_solid_fraction, cake)
+
+
+def fit_hinde_kalala(tests: Sequence[PilotTest], scene: Scene) -> Fit:
     """Fit the Hinde & Kalala model to the measured size distributions of `tests` by least squares.
 
-    The article's printed equations could not be consulted: this is a reading of its approach. What is
-    retained on a sieve decays exponentially with specific energy; that the rate is the sum
-    of two powers of size (`decay`) is chosen here. Two things are additions of this package. The edge,
-    a share of the product, sees `edge_energy` times the mean specific energy, the centre what is left.
-    The specific energy is energy_per_force * specific pressing force, its constant fitted to the specific
-    energies of `tests` by least squares, also where one was measured.
+    The article's printed equations could not be consulted: this is a reading of its approach. What is retained on a
+    sieve decays exponentially with specific energy; that the rate is the sum of two powers of size (`decay`) is chosen
+    here. Two things are additions of this package. The edge, a share of the product, sees `edge_energy` times the mean
+    specific energy, the centre what is left. The specific energy is energy_per_force * specific pressing force, its
+    constant fitted to the specific energies of `tests` by least squares, also where one was measured. Nothing is taken
+    of the `scene`.
 
     Raises
     ------
     ValueError
-        If the tests or fixed parameters cannot be fitted: one error that lists every fault.
+        If there are no tests, or none with a specific energy.
 
     Examples
     --------
     >>> import hpgr
-    >>> from hpgr.tables import read_pilot_tests
     >>> from hpgr.baselines import fit_hinde_kalala
+    >>> from hpgr.tables import read_pilot_tests
     >>> folder = hpgr.presets.DATA
     >>> tests = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
-    >>> fixed = {"bend": 0.0, "coarse_exponent": 1.0, "edge_share": 0.18, "edge_energy": 0.5}
-    >>> found = fit_hinde_kalala(tests[:1], fixed)
+    >>> found = fit_hinde_kalala(tests[:1], hpgr.presets.khd_pilot())
     >>> round(found.model.energy_per_force * 2.5e6 / 3600, 2)  # kWh/t at 2.5 N/mm2, as measured
     1.44
     """
-    fixed = dict(fixed or {})
-    faults = list(_fit_faults(tests, HindeKalala, fixed))
+    _refuse_none(tests)
     measured = [(test.specific_pressing_force, _specific_energy(test)) for test in tests]
     measured = [(force, energy) for force, energy in measured if not math.isnan(energy)]
-    if tests and not measured:
-        faults.append("specific_energy: got no measured one; one test must have it, or power and throughput; add it")
-    _refuse(faults)
+    if not measured:
+        raise ValueError("specific_energy: got no measured one; one test must have it, or power and throughput; add it")
     force, energy = np.array(measured).T
     model = HindeKalalaModel(float(max(test.sizes[-1] for test in tests)), float(force @ energy / (force @ force)))
-    found = _least_squares(model, tests, HindeKalala, fixed)
-    ore, free = found.parameters, not {"exponent", "coarse_exponent", "bend"} & fixed.keys()
-    if free and ore.exponent > ore.coarse_exponent:  # the powers may come out in either order
+    found = _least_squares(model, tests, HindeKalala)
+    ore = found.parameters
+    if ore.exponent > ore.coarse_exponent:  # the powers may come out in either order
         turned = {"exponent": ore.coarse_exponent, "coarse_exponent": ore.exponent, "bend": 1 - ore.bend}
         found = found._replace(parameters=ore._replace(**turned))
     return found
+
+
+MODELS = {"Torres & Casali": fit_torres_casali, "Hinde & Kalala": fit_hinde_kalala}
+
+
+def _refuse_none(tests: Sequence[PilotTest]) -> None:
+    if not tests:
+        raise ValueError("tests: got none; a fit needs at least one; give those to calibrate on")
 
 
 def _specific_energy(test: PilotTest) -> float:
@@ -408,9 +393,11 @@ def decay(parameters: HindeKalala, sizes: np.ndarray, reference_size: float) -> 
 # ---- fitting
 
 
-def _least_squares(model, tests, kind, fixed: dict[str, float]) -> Fit:
-    """Return the best fit over all starts."""
+def _least_squares(model, tests, kind) -> Fit:
+    """Return the best fit over all starts; what only centre and edge tell keeps its usual value without them."""
     search = _SEARCHES[kind]
+    apart = any(np.isfinite(test.centre).any() or np.isfinite(test.edge).any() for test in tests)
+    fixed = {} if apart else search.of_edges
     free = [name for name in kind._fields if name not in fixed]
 
     def parameters(vector):
@@ -426,68 +413,12 @@ def _least_squares(model, tests, kind, fixed: dict[str, float]) -> Fit:
 
     ends = (place_of(search.low), place_of(search.high))
     options = {"bounds": ends, "x_scale": "jac", "xtol": 1e-10, "ftol": 1e-10, "max_nfev": _EVALUATIONS}
-    fits = [optimize.least_squares(residuals, place_of(start), **options) for start in search.starts if free]
-    best = min(fits, key=lambda fit: fit.cost, default=None)
-    place, settled = ([], True) if best is None else (best.x, best.status > 0)
-    found = parameters(place)
-    rmse = float(np.sqrt(np.mean(residuals(place) ** 2)))
-    return Fit(model, found, rmse, tuple(name for name in free if _at_bound(found, name)), settled)
-
-
-def _at_bound(found: Any, name: str) -> bool:
-    ends = (getattr(end, name) for end in _SEARCHES[type(found)][:2])
-    return any(math.isclose(getattr(found, name), end, rel_tol=1e-3, abs_tol=1e-6) for end in ends)
+    fits = [optimize.least_squares(residuals, place_of(start), **options) for start in search.starts]
+    best = min(fits, key=lambda fit: fit.cost)
+    return Fit(model, parameters(best.x), float(np.sqrt(np.mean(best.fun**2))), tuple(free))
 
 
 def _differences(prediction: Prediction, test: PilotTest) -> np.ndarray:
     """Return model minus measurement in percent passing wherever there is one."""
     found = np.concatenate([100 * (getattr(prediction, name) - getattr(test, name)) for name in PRODUCTS])
     return found[~np.isnan(found)]
-
-
-# ---- bad input
-
-
-def _refuse(faults: Sequence[str]) -> None:
-    if faults:
-        raise ValueError("\n".join(faults))
-
-
-def _machine_faults(machine: Machine) -> list[str]:
-    faults = [
-        f"machine.{name}: got {value:g}; must be above 0 and finite; give it in SI"
-        for name, value in machine._asdict().items()
-        if not 0 < value < math.inf
-    ]
-    if not faults and not machine.bulk_density < machine.cake_density <= machine.solid_density:
-        faults.append(
-            f"machine: got bulk, cake and solid densities {machine.bulk_density:g}, {machine.cake_density:g}, "
-            f"{machine.solid_density:g} kg m-3; must rise in this order; correct the cake density"
-        )
-    return faults
-
-
-def _fit_faults(tests: Sequence[PilotTest], kind: Any, fixed: Mapping[str, float]) -> Iterator[str]:
-    """Yield why parameters of `kind` cannot be fitted to `tests`."""
-    search = _SEARCHES[kind]
-    for name, value in fixed.items():
-        if name not in kind._fields:
-            close = difflib.get_close_matches(name, kind._fields, n=1, cutoff=0.3) or [kind._fields[0]]
-            yield f"fixed: got {name!r}; must be one of {', '.join(kind._fields)}; did you mean {close[0]!r}?"
-            continue
-        low, high = getattr(search.low, name), getattr(search.high, name)
-        if not low <= value <= high:
-            yield f"fixed {name}: got {value:g}; must be within {low:g} and {high:g}; correct it"
-    if not tests:
-        yield "tests: got none; a fit needs at least one; give those to calibrate on"
-        return
-    missing = [name for name in kind._fields if name in search.of_edges - fixed.keys()]
-    if missing and not any(np.isfinite(test.centre).any() or np.isfinite(test.edge).any() for test in tests):
-        yield (
-            f"tests: got no centre or edge product; {' and '.join(missing)} cannot be fitted to the total alone; "
-            f"give fixed={{{missing[0]!r}: ...}}"
-        )
-    known = sum(np.isfinite(getattr(test, name)).sum() for test in tests for name in PRODUCTS)
-    free = len(set(kind._fields) - fixed.keys())
-    if known < free:
-        yield f"tests: got {known} measured points; must be at least the {free} free parameters; add tests"

@@ -1,18 +1,19 @@
-"""Calibrate ore and machine to pilot tests, and predict other tests.
+"""Calibrate ore and machine to pilot tests, and predict other tests with their uncertainty.
 
-Force and speed of a test are set, as on the machine; the gap follows. Moduli, nip angle and idle torque are fitted to
-throughput, power and cake thickness, by the least squares of the percent they are missed by; strength, fragments and
-the fall of pressure along the roll width to the percent passing of the product at centre and edge of the width and in
-total, where measured. Every evaluation draws the same random numbers, so the objective is smooth.
+Force and speed of a test are set, as on the machine; the gap follows. All parameters are fitted together, by the least
+squares of what is missed of the percent passing of the product (centre and edge of the roll width, and total) and of
+throughput, power and opening. Ore constants are shared by all tests; those of the machine, nip angle, moduli and idle
+torque, belong to a machine and a feed. Every evaluation draws the same random numbers, so the objective is smooth.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from hpgr.bed import machine
 from hpgr.bed.loaded import Beds
@@ -23,75 +24,63 @@ from hpgr.run import load, run_scene
 from hpgr.scene import Scene, field_info
 from hpgr.tables import PilotTest, read_pilot_tests
 
-_PARTS, _MEASURED = ("centre", "edge", "total"), ("throughput", "power", "cake_thickness")
-_PRODUCT = "percent passing"
-_OF_MACHINE = ("K", "alpha", "T_0")  # fitted to what is measured of the machine; the others to the product
-_ROUNDS = 2
-_STEPS = (0.03, 0.01)  # of central differences, in the units below: wide first, or counting cells would show
-_LOST = 1e3  # percent that a trial is off whose force no gap carries: it is never taken
-_CONFIDENCE = 0.95
-_MODULI = ("bulk_modulus", "shear_modulus")
+PARTS, FIGURES = ("centre", "edge", "total"), ("throughput", "power", "specific_energy")
+_OF_MACHINE = ("throughput", "power", "gap")  # what is measured of the machine and fitted to
+_WEIGHTS = {"centre": 1.0, "edge": 1.0, "total": 3.0, "throughput": 2.0, "power": 2.0, "gap": 2.0}  # of residuals
+_ERROR = 3.0  # percent (passing) that a model is typically off: the unit of residuals beside what is believed before
+_CORRELATED = 1.0  # nepers of size over which the residuals of one curve are correlated
+_STEP = 0.01  # of differences, in spreads
+_LOST = 60.0  # percent that a trial is off whose force no gap carries
+_TOLD = 0.6  # posterior over prior spread above which the tests do not tell a parameter
+_ALIKE = 1e-3  # of passing, within which two feeds are one
+_GAP, _SOLID = 0.027, 0.83  # opening over diameter, and solid fraction there, of usual machines, to start from
 _CRITICAL = 0.9  # part of the product below the size that the middle of the roll width just breaks, to start from
-_CUSHIONINGS = (1.0, 0.5)  # n to start from; from 1 alone the fit to the KHD tests ends 2 % above its minimum
-_BEDS = 64  # loaded beds kept while fitting
-_UNDETERMINED = 1e-6  # least singular value over the largest below which tests do not tell parameters apart
+_BEDS = 256  # loaded beds kept while fitting
+_LEVEL = 1.645  # standard deviations of a 90 % interval
+_FEWEST = 3  # tests from which the discrepancy is told by leaving one out
+_MACHINES = ("alpha", "K", "T_0")
 
 
 class Parameter(NamedTuple):
-    """A parameter that can be fitted.
-
-    Attributes
-    ----------
-    field : str
-        Scene field.
-    low, high : float
-        Bounds, in the field's unit.
-    logarithmic : bool
-        Whether its logarithm is fitted; else the value in units of `high`.
-    follower : str
-        Scene field that keeps its ratio to this one.
-    """
+    """A parameter that can be fitted: its scene field and bounds there."""
 
     field: str
     low: float
     high: float
-    logarithmic: bool = True
-    follower: str = ""
+    spread: float  # standard deviation of the fitted number, around its start, that is believed before any test
+    logarithmic: bool = True  # whether the logarithm is fitted
+    follower: str = ""  # scene field that keeps its ratio to this one
 
     def scaled(self, value: float) -> float:
         """Return the number that is fitted."""
-        return math.log(value) if self.logarithmic else value / self.high
+        value = min(max(value, self.low), self.high)
+        return math.log(value) if self.logarithmic else value
 
     def value(self, scaled: float) -> float:
         """Return the field's value of a fitted number."""
-        return math.exp(scaled) if self.logarithmic else scaled * self.high
+        return math.exp(scaled) if self.logarithmic else scaled
 
 
 PARAMETERS = {
-    "sigma_m": Parameter("strength.reference_strength", 1e3, 1e10),
-    "w": Parameter("strength.weibull_modulus", 0.05, 100.0),
-    "gamma": Parameter("fragments.exponent", 0.02, 20.0),
-    "n": Parameter("strength.cushioning", 0.05, 100.0),
-    "K": Parameter("elasticity.bulk_modulus", 1e5, 1e12, follower="elasticity.shear_modulus"),
-    "alpha": Parameter("flow.nip_angle", math.radians(1), math.radians(45)),
-    "kappa": Parameter("roll_width.pressure_drop", 0.0, 1.0, logarithmic=False),
-    "T_0": Parameter("rolls.idle_torque", 0.0, 1e6, logarithmic=False),
+    "sigma_m": Parameter("strength.reference_strength", 1e3, 1e12, 2.0),
+    "w": Parameter("strength.weibull_modulus", 0.05, 100.0, 1.0),
+    "k": Parameter("strength.scatter", 0.05, 50.0, 0.8),
+    "n": Parameter("strength.cushioning", 0.05, 100.0, 1.0),
+    "gamma": Parameter("fragments.exponent", 0.02, 20.0, 1.0),
+    "nu": Parameter("fragments.size_exponent", -5.0, 5.0, 1.5, logarithmic=False),
+    "K": Parameter("elasticity.bulk_modulus", 1e3, 1e12, 2.0, follower="elasticity.shear_modulus"),
+    "alpha": Parameter("flow.nip_angle", math.radians(1), math.radians(45), 0.2),
+    "epsilon": Parameter("roll_width.edge_ratio", 1e-3, 1.0, 1.0),
+    "kappa": Parameter("roll_width.pressure_drop", 0.0, 1.0, 0.3, logarithmic=False),
+    "T_0": Parameter("rolls.idle_torque", 0.0, 1e6, 5e3, logarithmic=False),
 }
-
-
-class Estimate(NamedTuple):
-    """A fitted value with its 95 % confidence interval, in SI; the interval is infinite where tests do not tell."""
-
-    value: float
-    low: float
-    high: float
-    unit: str
+FIT = ("sigma_m", "w", "k", "gamma", "nu", "epsilon", "alpha", "K")
 
 
 class Prediction(NamedTuple):
-    """What a scene says of a test: SI; size distributions (size,) at the test's sieves, fractions.
+    """What a scene says of a test, SI; size distributions (size,) at the test's sieves, fractions, None if not known.
 
-    `centre` and `edge` are of the roll width, None for a scene without one; all three for one that is stress only.
+    `lower` and `upper` have the ends of the 90 % interval of every quantity by name, for a calibration.
     """
 
     gap: float
@@ -101,6 +90,22 @@ class Prediction(NamedTuple):
     centre: np.ndarray | None
     edge: np.ndarray | None
     total: np.ndarray | None
+    lower: Mapping[str, Any] = MappingProxyType({})
+    upper: Mapping[str, Any] = MappingProxyType({})
+
+
+class Estimate(NamedTuple):
+    """A fitted value with its 95 % interval, in SI."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+
+    def __str__(self) -> str:
+        if self.low <= 0 < self.value or self.high > 10 * self.low > 0:
+            return f"{show(self.value, self.unit, 4)} (not determined by these tests)"
+        return f"{show(self.value, self.unit, 4)} ({show(self.low, self.unit, 3)} to {show(self.high, self.unit, 3)})"
 
 
 class Calibration(NamedTuple):
@@ -109,37 +114,66 @@ class Calibration(NamedTuple):
     Attributes
     ----------
     scene : Scene
-        The scene with the fitted values; its feed, speed and force are those of the first test.
+        The scene with the fitted values; its machine, feed, speed and force are those of the first test.
     estimates : dict
-        Fitted values by symbol.
+        Fitted values by symbol; those of a machine and feed beyond the first by symbol and first test, "K of B1".
     residuals : dict
         By test and measured quantity ("centre", "edge", "total": percent passing, (size,); "throughput", "power",
-        "cake_thickness": percent), predicted less measured.
-    at_bound : tuple
-        Symbols of the fitted values that ended at a bound.
+        "gap": percent), predicted less measured.
+    covariance : ndarray
+        Of the numbers that are fitted, (estimate, estimate): logarithms, except of kappa, nu and T_0.
     undetermined : tuple
-        Symbols whose values the tests do not tell apart.
+        Names of the estimates that the tests do not tell: left at their start.
+    at_bound : tuple
+        Names of the estimates that ended at a bound.
+    discrepancy : dict
+        By quantity what the model misses of tests it has not seen, as a standard deviation: of figures a fraction, of
+        distributions F the factor of 2 sqrt(F (1 - F)).
     """
 
     scene: Scene
     estimates: dict[str, Estimate]
     residuals: dict[str, dict[str, np.ndarray]]
-    at_bound: tuple[str, ...]
+    covariance: np.ndarray
     undetermined: tuple[str, ...]
+    at_bound: tuple[str, ...]
+    discrepancy: dict[str, float]
+    problem: "_Problem"
+    place: np.ndarray
 
-    def predict(self, test: PilotTest) -> Prediction:
-        """Return what the fitted scene says of a test, from its feed, speed and force alone."""
-        return predict(self.scene, test)
+    def predict(self, test: PilotTest, intervals: bool = True) -> Prediction:
+        """Return what the fitted scene says of a test, from its machine, feed, speed and force alone, with intervals.
+
+        A machine and feed that were not fitted take the constants of the first that was.
+        """
+        found = self.problem.predict(self.place, test)
+        if not intervals:
+            return found
+        slopes = [self.problem.slope(self.place, k, test, found) for k in range(self.place.size)]
+        lower, upper = {}, {}
+        for name in (*PARTS, *FIGURES, "gap"):
+            value = getattr(found, name)
+            if value is None:
+                continue
+            change = np.array([one[name] for one in slopes])
+            variance = np.einsum("i...,ij,j...->...", change, self.covariance, change)
+            off = self.discrepancy.get(name, 0.0) * _scale(value, name)
+            reach, most = _LEVEL * np.sqrt(variance + off**2), 1.0 if name in PARTS else math.inf
+            lower[name], upper[name] = np.clip(value - reach, 0, most), np.clip(value + reach, 0, most)
+        return found._replace(lower=lower, upper=upper)
+
+    def sample(self, n: int, seed: int) -> list[Scene]:
+        """Return `n` scenes that the tests leave possible: parameters drawn with their covariance."""
+        drawn = np.random.default_rng(seed).multivariate_normal(self.place, self.covariance, n)
+        low, high = self.problem.bounds()
+        return [self.scene.with_values(self.problem.values(place, 0)) for place in np.clip(drawn, low, high)]
 
     def __str__(self) -> str:
         lines = [f"calibrated on {', '.join(self.residuals)}"]
         for name, found in self.estimates.items():
-            value, low, high = (show(one, found.unit) for one in found[:3])
-            spread = f"{low} to {high}" if math.isfinite(found.high) else "any value"
+            left = f"{show(found.value, found.unit, 4)} (not determined by these tests, left at its start)"
             told = " (at its bound)" if name in self.at_bound else ""
-            lines.append(f"{name:>8} = {value} ({spread}){told}")
-        if self.undetermined:
-            lines.append(f"the tests do not tell apart {', '.join(self.undetermined)}")
+            lines.append(f"{name:>8} = {left if name in self.undetermined else found}{told}")
         return "\n".join(lines)
 
 
@@ -148,7 +182,7 @@ def calibrate(
     feed: Feed | None,
     product: str | Path,
     operations: str | Path,
-    fit: Sequence[str] = ("sigma_m", "w", "gamma", "K"),
+    fit: Sequence[str] | None = None,
     tests: Sequence[str] | None = None,
 ) -> Calibration:
     """Fit parameters of `scene` to the pilot tests of two CSV files.
@@ -156,36 +190,34 @@ def calibrate(
     Parameters
     ----------
     scene : Scene
-        Machine, ore and resolution to start from. With flow "nip" it needs a nip angle or a cake density, and with
-        `roll_width` centre and edge of the width are told apart.
+        Machine, ore and resolution to start from; with `roll_width` centre and edge of the width are told apart. What
+        the tests tell of their machine (roll diameter and width, solid density, idle power) takes its place.
     feed : Feed, optional
         Feed of all tests; default each test's own.
     product, operations : path
         Tables as `hpgr.tables.read_pilot_tests` takes them.
-    fit : sequence of str
-        Symbols to fit: sigma_m, w, gamma, n, K (G keeps its ratio to it), alpha (nip angle), kappa (roll width), T_0
-        (idle torque).
+    fit : sequence of str, optional
+        Symbols to fit, of `PARAMETERS` (G keeps its ratio to K); default those of `FIT` that the scene has.
     tests : sequence of str, optional
         Names of the tests to fit to; default all.
 
     Returns
     -------
     Calibration
-        Estimates with 95 % confidence intervals from the curvature at the minimum. They take residuals as independent,
-        which those of one cumulative curve are not: they are too narrow rather than too wide.
+        Estimates with 95 % intervals from the curvature at the minimum and what is believed before any test, a broad
+        normal distribution around the start; residuals of one curve are taken as correlated. With three tests or more
+        the discrepancy is told by leaving out one at a time, else by those of the fit, twice, and at least 3 %.
 
     Raises
     ------
     OSError, ValueError
-        If a table cannot be read, a name is unknown, there are fewer measured values than parameters, or the scene
-        cannot carry the tests' forces to begin with.
+        If a table cannot be read or a name is unknown, or the scene lacks what is to be fitted.
 
     Examples
     --------
     >>> import hpgr
     >>> folder = hpgr.presets.DATA
-    >>> coarse = {"resolution.points": 40, "resolution.streamlines": 1, "strength.cushioning": float("inf")}
-    >>> scene = hpgr.presets.khd_pilot().with_values(coarse)
+    >>> scene = hpgr.presets.khd_pilot().with_values({"resolution.points": 40, "resolution.streamlines": 1})
     >>> product, operations = folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv"
     >>> found = hpgr.calibrate(scene, None, product, operations, fit=["sigma_m", "gamma"], tests=["K-P1"])
     >>> list(found.estimates)
@@ -197,96 +229,68 @@ def calibrate(
     if unknown or not wanted:
         told = ", ".join(unknown) or "none"
         raise ValueError(f"tests: got {told}; must be among {', '.join(known)}; correct the names, or leave it out")
-    return fit_tests(scene, [known[name] for name in wanted], fit, feed)
+    found = fit_tests(scene, [known[name] for name in wanted], fit, feed)
+    return validated(found) if len(wanted) >= _FEWEST else found
 
 
-def fit_tests(scene: Scene, tests: Sequence[PilotTest], fit: Sequence[str], feed: Feed | None = None) -> Calibration:
-    """Fit parameters of `scene` to tests, as `calibrate` does to those of files."""
+def fit_tests(
+    scene: Scene,
+    tests: Sequence[PilotTest],
+    fit: Sequence[str] | None = None,
+    feed: Feed | None = None,
+    near: Calibration | None = None,
+) -> Calibration:
+    """Fit parameters of `scene` to tests, as `calibrate` does to those of files; quicker from one `near` by."""
     names = _known_names(scene, fit)
-    scene = _started(scene.with_values({"resolution.record": "product"}), names, tests[0], feed)
-    trial = _Trial(scene, [_at_test(scene, test, feed) for test in tests], tests, names)
-    fitted = [PARAMETERS[name] for name in names]
-    bounds = np.array([[one.scaled(one.low) for one in fitted], [one.scaled(one.high) for one in fitted]])
-    place = np.array([one.scaled(_value_of(scene, name)) for one, name in zip(fitted, names, strict=True)])
-    machine_part = [k for k, name in enumerate(names) if name in _OF_MACHINE]
-    product_part = [k for k, name in enumerate(names) if name not in _OF_MACHINE]
-    trial.refuse_unfit(place, machine_part, product_part)
-    # kappa, of the product, takes part of the force: a second round settles both
-    for turn in range(_ROUNDS if machine_part and product_part else 1):
-        place = _minimise(trial.machine, place, bounds, machine_part, _STEPS)
-        place = _fit_product(trial, place, bounds, product_part, first=turn == 0)
-    return _calibration(trial, place, bounds, [(trial.machine, machine_part), (trial.product, product_part)])
+    problem = _Problem(scene.with_values({"resolution.record": "product"}), list(tests), names, feed)
+    start = problem.start()
+    place, free = start if near is None else problem.from_estimates(near, start), list(range(start.size))
+    while True:  # one after another is left at its start, until the tests tell the rest
+        place = problem.minimise(place, start, free)
+        slopes = problem.slopes(place)
+        doubt = np.sqrt(np.diag(problem.covariance(place, slopes, free))) / problem.spreads()[free]
+        if not free or doubt.max() < _TOLD:
+            break
+        place[free[int(doubt.argmax())]] = start[free[int(doubt.argmax())]]
+        free.pop(int(doubt.argmax()))
+    return _calibration(problem, place, slopes, free)
 
 
-def _fit_product(trial: "_Trial", place: np.ndarray, bounds: np.ndarray, free: list[int], first: bool) -> np.ndarray:
-    if first and solve.choose(trial.scene) == "march":  # the closed form gives the starting point
-        smooth = [k for k in free if trial.names[k] != "n"]
-        place = _minimise(trial.smooth_product, place, bounds, smooth, _STEPS[:1])
-    if first and "n" in trial.names:
-        place = _best_start(trial.product, place, bounds, free, trial.names.index("n"))
-    return _minimise(trial.product, place, bounds, free, _STEPS if first else _STEPS[-1:])
+def left_out(found: Calibration, count: int = 1) -> Iterator[tuple[PilotTest, Calibration]]:
+    """Yield every test with a fit to the others, `count` of them left out at a time."""
+    problem = found.problem
+    for out in combinations(range(len(problem.tests)), count):
+        kept = [test for k, test in enumerate(problem.tests) if k not in out]
+        fitted = fit_tests(problem.scene, kept, problem.names, problem.feed, near=found)
+        yield from ((problem.tests[k], fitted) for k in out)
 
 
-class _Trial:
-    """Residuals of trial values, given as the numbers that are fitted; NaN-free, for those measured."""
-
-    def __init__(self, scene: Scene, cases: list[Scene], tests: Sequence[PilotTest], names: list[str]):
-        self.scene, self.cases, self.tests, self.names = scene, cases, tests, names
-        self._beds = Beds(_BEDS)
-
-    def machine(self, place: np.ndarray) -> np.ndarray:
-        """Return by how many percent throughput, power and cake thickness are missed."""
-        return self._missed(place, _MEASURED, {"resolution.cells": 0})
-
-    def product(self, place: np.ndarray) -> np.ndarray:
-        """Return by how many percent passing the product is missed."""
-        return self._missed(place, _PARTS, {})
-
-    def smooth_product(self, place: np.ndarray) -> np.ndarray:
-        """Return the same without cushioning, by the closed form."""
-        return self._missed(place, _PARTS, {"strength.cushioning": math.inf})
-
-    def refuse_unfit(self, place: np.ndarray, machine_part: list[int], product_part: list[int]) -> None:
-        """Raise ValueError if there is too little to fit to, or no gap carries the forces to begin with."""
-        for free, found, what in (
-            (machine_part, self.machine(place), "throughput, power and cake thickness"),
-            (product_part, self.smooth_product(place), _PRODUCT),
-        ):
-            symbols = ", ".join(self.names[k] for k in free)
-            if found.size < len(free):
-                raise ValueError(
-                    f"fit: got {symbols}, fitted to {what}; must be at most as many as the {found.size} values of "
-                    f"these; {_more_values(self.scene, what)}"
-                )
-            if (found == _LOST).any():
-                raise ValueError(
-                    "scene: no gap carries the force of every test with the moduli and nip angle that the fit begins "
-                    "with; one must; give another elasticity.bulk_modulus, such as '600 MPa', or flow.nip_angle"
-                )
-
-    def _missed(self, place: np.ndarray, names: Sequence[str], extra: dict[str, Any]) -> np.ndarray:
-        values = _values(self.scene, self.names, place) | extra
-        parts = [self._of_test(case, test, values, names) for case, test in zip(self.cases, self.tests, strict=True)]
-        return np.concatenate(parts)
-
-    def _of_test(self, case: Scene, test: PilotTest, values: dict[str, Any], names: Sequence[str]) -> np.ndarray:
-        try:
-            off = _residuals(_predict(case.with_values(values), self._beds), test)
-        except ValueError:  # no gap carries the force
-            off = {name: np.full(np.size(getattr(test, name)), _LOST) for name in self._compared(test)}
-        flat = np.concatenate([off[name] for name in names if name in off] or [np.empty(0)])
-        return flat[~np.isnan(flat)]
-
-    def _compared(self, test: PilotTest) -> list[str]:
-        apart = ("centre", "edge") if self.scene.roll_width is not None else ()
-        return [name for name in (*apart, "total", *_MEASURED) if not np.isnan(getattr(test, name)).all()]
+def validated(found: Calibration) -> Calibration:
+    """Return the calibration with the discrepancy that leaving out one test at a time tells."""
+    pairs = [(test, other.predict(test, intervals=False)) for test, other in left_out(found)]
+    return found._replace(discrepancy=discrepancy(pairs))
 
 
-def predict(scene: Scene, test: PilotTest, feed: Feed | None = None, floating: bool = True) -> Prediction:
-    """Return what `scene` says of a test, from its feed, speed and force.
+def discrepancy(
+    pairs: Sequence[tuple[PilotTest, Prediction]], factor: float = 1.0, least: float = 0.0
+) -> dict[str, float]:
+    """Return by quantity the standard deviation of measured tests about their predictions, as in `Calibration`."""
+    found = {}
+    for name in (*PARTS, *FIGURES, "gap"):
+        both = [_both(said, test, name) for test, said in pairs]
+        off, scale = (np.concatenate([one[k] for one in both]) for k in (0, 1))
+        if np.any(scale > 0):
+            found[name] = max(factor * math.sqrt(np.sum(off**2) / np.sum(scale**2)), least)
+    return found
 
-    With `floating` off, the gap is the test's cake thickness, or its working gap where that was not measured, and the
-    force follows instead.
+
+def _scale(value: np.ndarray, name: str) -> np.ndarray:
+    """Return what a discrepancy is a part of: the figure itself; 2 sqrt(F (1 - F)) of a distribution."""
+    return 2 * np.sqrt(np.clip(value * (1 - value), 0, None)) if name in PARTS else value
+
+
+def predict(scene: Scene, test: PilotTest, feed: Feed | None = None) -> Prediction:
+    """Return what `scene` says of a test, from its machine, feed, speed and force.
 
     Examples
     --------
@@ -300,73 +304,262 @@ def predict(scene: Scene, test: PilotTest, feed: Feed | None = None, floating: b
     >>> abs(said.power / first.power - 1) < 0.1
     True
     """
-    return _predict(_at_test(scene.with_values({"resolution.record": "product"}), test, feed, floating))
+    return _predict(_at_test(scene.with_values({"resolution.record": "product"}), test, feed))
 
 
-def _at_test(scene: Scene, test: PilotTest, feed: Feed | None, floating: bool = True) -> Scene:
-    """Return the scene at the speed, force and feed of a test, with its sieves."""
-    table = tuple((size, 100 * part) for size, part in zip(test.sizes.tolist(), test.feed.tolist(), strict=True))
-    known = ~np.isnan(test.feed)
-    values: dict[str, Any] = {
-        "rolls.speed": test.surface_speed / (scene.rolls.diameter / 2),
-        "rolls.specific_pressing_force": test.specific_pressing_force if floating else None,
-        "feed": feed or TableFeed(table=[row for row, here in zip(table, known, strict=True) if here]),
-        "resolution.sieves": tuple(test.sizes.tolist()),
+class _Problem:
+    """Tests, and the numbers that are fitted to them: a column for every symbol, or every symbol and group of tests."""
+
+    def __init__(self, scene: Scene, tests: list[PilotTest], names: list[str], feed: Feed | None):
+        self.scene, self.tests, self.names, self.feed = scene, tests, names, feed
+        self._beds, self._found = Beds(_BEDS), {}
+        self.groups = [next(k for k, other in enumerate(tests) if _one_machine(test, other)) for test in tests]
+        self.columns = [
+            (name, group) for name in names for group in (sorted(set(self.groups)) if name in _MACHINES else [0])
+        ]
+
+    def labels(self) -> list[str]:
+        return [name if group == 0 else f"{name} of {self.tests[group].name}" for name, group in self.columns]
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        fitted = [PARAMETERS[name] for name, _ in self.columns]
+        return np.array([one.scaled(one.low) for one in fitted]), np.array([one.scaled(one.high) for one in fitted])
+
+    def spreads(self) -> np.ndarray:
+        return np.array([PARAMETERS[name].spread for name, _ in self.columns])
+
+    def values(self, place: np.ndarray, group: int) -> dict[str, Any]:
+        """Return the scene fields of a group of tests, followers included."""
+        values = {}
+        for (name, column), number in zip(self.columns, place, strict=True):
+            parameter = PARAMETERS[name]
+            if name not in _MACHINES or column == group:
+                values[parameter.field] = parameter.value(float(number))
+                if parameter.follower:
+                    ratio = _field(self.scene, parameter.follower) / _field(self.scene, parameter.field)
+                    values[parameter.follower] = ratio * values[parameter.field]
+        return values
+
+    def start(self) -> np.ndarray:
+        """Return the place to start from: beds that carry the tests' forces near their gaps."""
+        started = {group: _started(self.scene, self.names, self.tests[group], self.feed) for group in set(self.groups)}
+        return np.array([PARAMETERS[name].scaled(_field(started[group], PARAMETERS[name].field))
+                         for name, group in self.columns])  # fmt: skip
+
+    def from_estimates(self, near: Calibration, start: np.ndarray) -> np.ndarray:
+        """Return the place that has what another calibration has found."""
+        known = dict(zip(near.problem.labels(), near.place, strict=True))
+        return np.array([known.get(label, number) for label, number in zip(self.labels(), start, strict=True)])
+
+    def predict(self, place: np.ndarray, test: PilotTest) -> Prediction:
+        """Return what the model says of a test, which may be none of those fitted."""
+        group = next((k for k in self.groups if _one_machine(test, self.tests[k])), 0)
+        values = self.values(place, group)
+        key = *test[: test._fields.index("sizes")], test.sizes.tobytes(), test.feed.tobytes(), *values.values()
+        if key not in self._found:
+            if len(self._found) > 64 * len(self.tests):
+                self._found.clear()
+            self._found[key] = _predict(_at_test(self.scene, test, self.feed).with_values(values), self._beds)
+        return self._found[key]
+
+    def slope(self, place: np.ndarray, k: int, test: PilotTest, at: Prediction) -> dict[str, np.ndarray]:
+        """Return the derivatives of a prediction with number `k`, by a difference that stays within the bounds."""
+        step = _STEP * self.spreads()[k]
+        step = -step if place[k] + step > self.bounds()[1][k] else step
+        moved = place.copy()
+        moved[k] += step
+        said = self.predict(moved, test)
+        names = [name for name in (*PARTS, *FIGURES, "gap") if getattr(at, name) is not None]
+        return {name: (getattr(said, name) - getattr(at, name)) / step for name in names}
+
+    def residuals(self, place: np.ndarray) -> np.ndarray:
+        """Return the weighted residuals of all tests, in units of a typical error."""
+        return np.concatenate([self._of_test(place, test) for test in self.tests])
+
+    def _of_test(self, place: np.ndarray, test: PilotTest) -> np.ndarray:
+        try:
+            off = _residuals(self.predict(place, test), test)
+        except ValueError:  # no gap carries the force
+            off = {name: np.full(len(sizes), _LOST) for name, sizes in self._compared(test)}
+        return np.concatenate(
+            [_WEIGHTS[name] / _ERROR * off[name] for name, _ in self._compared(test)] or [np.empty(0)]
+        )
+
+    def _compared(self, test: PilotTest) -> list[tuple[str, np.ndarray]]:
+        """Return what a test and the scene have both, and the sizes at which it was measured, 1 m of a figure."""
+        apart = PARTS if self.scene.roll_width is not None else ("total",)
+        names = (*(apart if self.scene.resolution.cells else ()), *_OF_MACHINE)
+        sizes = {name: test.sizes if name in PARTS else np.ones(1) for name in names}
+        found = [(name, sizes[name][np.isfinite(measured(test, name))]) for name in names]
+        return [(name, one) for name, one in found if one.size]
+
+    def slopes(self, place: np.ndarray) -> np.ndarray:
+        """Return the derivatives (residual, number) by differences that stay within the bounds."""
+        here, high, columns = self.residuals(place), self.bounds()[1], []
+        for k, step in enumerate(_STEP * self.spreads()):
+            moved = place.copy()
+            moved[k] += -step if place[k] + step > high[k] else step
+            columns.append((self.residuals(moved) - here) / (moved[k] - place[k]))
+        return np.array(columns).T
+
+    def minimise(self, place: np.ndarray, start: np.ndarray, free: list[int]) -> np.ndarray:
+        """Return the place of the least squares over the free numbers, each drawn to its start by its spread."""
+        from scipy.optimize import least_squares  # late: loading it takes 0.3 s
+
+        if not free:
+            return place
+        low, high = (end[free] for end in self.bounds())
+        spreads = self.spreads()[free]
+
+        def at(part: np.ndarray) -> np.ndarray:
+            whole = place.copy()
+            whole[free] = part
+            return whole
+
+        found = least_squares(
+            lambda part: np.append(self.residuals(at(part)), (part - start[free]) / spreads),
+            np.clip(place[free], low, high),
+            lambda part: np.vstack([self.slopes(at(part))[:, free], np.diag(1 / spreads)]),
+            bounds=(low, high), x_scale=spreads, xtol=1e-4, ftol=1e-4, max_nfev=40,
+        )  # fmt: skip
+        return at(found.x)
+
+    def covariance(self, place: np.ndarray, slopes: np.ndarray, free: list[int]) -> np.ndarray:
+        """Return the covariance of the free numbers: the residuals of a curve are correlated, and scatter as found."""
+        slopes, before, off = slopes[:, free], np.diag(self.spreads()[free] ** -2.0), self.residuals(place)
+        variance = off @ off / max(off.size - len(free), 1)
+        inverse = np.linalg.inv(slopes.T @ slopes + before)
+        return inverse @ (variance * slopes.T @ self._correlation() @ slopes + before) @ inverse
+
+    def _correlation(self) -> np.ndarray:
+        """Return the correlation of the residuals: within a curve it falls with the ratio of sizes."""
+        curves = [(k, name, one) for k, test in enumerate(self.tests) for name, one in self._compared(test)]
+        where = np.log(np.concatenate([one for *_, one in curves] or [np.empty(0)]))
+        curve = np.repeat(np.arange(len(curves)), [one.size for *_, one in curves])
+        apart = np.abs(np.subtract.outer(where, where)) / _CORRELATED
+        return np.exp(-apart) * np.equal.outer(curve, curve)
+
+
+def _calibration(problem: _Problem, place: np.ndarray, slopes: np.ndarray, free: list[int]) -> Calibration:
+    labels, (low, high), every = problem.labels(), problem.bounds(), list(range(place.size))
+    covariance = problem.covariance(place, slopes, every)
+    estimates = {}
+    for k, (name, _) in enumerate(problem.columns):
+        parameter, reach = PARAMETERS[name], 1.96 * math.sqrt(covariance[k, k])
+        ends = [parameter.value(min(max(place[k] + side * reach, low[k]), high[k])) for side in (-1, 1)]
+        estimates[labels[k]] = Estimate(parameter.value(place[k]), *ends, field_info(parameter.field).unit)
+    said = [(test, problem.predict(place, test)) for test in problem.tests]
+    at_bound = np.minimum(place - low, high - place) < 1e-3 * (high - low)
+    return Calibration(
+        _at_test(problem.scene, problem.tests[0], problem.feed).with_values(problem.values(place, 0)),
+        estimates,
+        {test.name: _residuals(one, test) for test, one in said},
+        covariance,
+        tuple(labels[k] for k in every if k not in free),
+        tuple(labels[k] for k in free if at_bound[k]),
+        discrepancy(said, factor=2.0, least=_ERROR / 100),
+        problem,
+        place,
+    )
+
+
+def _one_machine(test: PilotTest, other: PilotTest) -> bool:
+    """Return whether two tests are of one machine and one feed."""
+    if (test.diameter, test.width) != (other.diameter, other.width) and not math.isnan(test.diameter):
+        return False
+    apart = np.interp(np.log(other.sizes), np.log(test.sizes), test.feed) - other.feed
+    return bool(np.nanmax(np.abs(apart)) < _ALIKE)
+
+
+def measured(test: PilotTest, name: str) -> np.ndarray:
+    """Return what was measured of a quantity, NaN where it was not.
+
+    The gap is the working gap where the throughput fits through it below the density of rock, else the cake's.
+    """
+    if name == "gap":
+        solid = test.throughput / (test.gap * test.width * test.surface_speed * test.solid_density)
+        return np.atleast_1d(test.gap if solid < 1 or math.isnan(test.cake_thickness) else test.cake_thickness)
+    if name == "specific_energy" and math.isnan(test.specific_energy):
+        return np.atleast_1d(test.power / test.throughput)
+    return np.atleast_1d(getattr(test, name))
+
+
+def _both(said: Prediction, test: PilotTest, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return predicted less measured where both are known, and what a discrepancy is a part of there."""
+    value, seen = getattr(said, name), measured(test, name)
+    kept = np.isfinite(seen) & (value is not None)
+    value = np.broadcast_to(np.nan if value is None else value, seen.shape)[kept]
+    return value - seen[kept], _scale(value, name)
+
+
+def _at_test(scene: Scene, test: PilotTest, feed: Feed | None) -> Scene:
+    """Return the scene at the machine, speed, force and feed of a test, with its sieves."""
+    known, rolls = ~np.isnan(test.feed), scene.rolls
+    diameter = rolls.diameter if math.isnan(test.diameter) else test.diameter
+    speed = test.surface_speed / (diameter / 2)
+    table = [
+        (size, 100 * part) for size, part in zip(test.sizes[known].tolist(), test.feed[known].tolist(), strict=True)
+    ]
+    told = {
+        "rolls.width": test.width,
+        "bed.solid_density": test.solid_density,
+        "rolls.idle_torque": test.idle_power / speed,
     }
-    if (
-        getattr(scene.flow, "cake_solid_fraction", None) is not None
-    ):  # the angle is the ore's; it is held while the gap floats
-        values |= {"flow.nip_angle": _nip_angle(scene), "flow.cake_solid_fraction": None}
-    if not floating:
-        values["rolls.gap"] = test.gap if math.isnan(test.cake_thickness) else test.cake_thickness
-    return scene.with_values(values)
+    return scene.with_values({name: value for name, value in told.items() if not math.isnan(value)} | {
+        "rolls.diameter": diameter,
+        "rolls.entry_gap": rolls.entry_gap * diameter / rolls.diameter,
+        "rolls.speed": speed,
+        "rolls.specific_pressing_force": test.specific_pressing_force,
+        "feed": feed or TableFeed(table=table),
+        "resolution.sieves": tuple(test.sizes.tolist()),
+        "flow": scene.flow.held(rolls.gap, rolls.diameter, scene.bed.feed_solid_fraction),
+    })  # fmt: skip
 
 
 def _predict(scene: Scene, beds: Beds | None = None) -> Prediction:
-    """Predict; `beds` keeps the loaded beds of trials, which those of another strength share (2 x faster)."""
+    """Predict; `beds` keeps the loaded beds of trials, which those of another strength share."""
     found = run_scene(scene, beds=beds)
     names = ("passing_width_centre", "passing_width_edge", "passing_total")
     products = [None if found.values.get(name) is None else np.asarray(found.values[name]) for name in names]
-    figures = (float(found.values[name]) for name in ("throughput", "power", "specific_energy"))
-    return Prediction(found.scene.rolls.gap, *figures, *products)
+    return Prediction(found.scene.rolls.gap, *(float(found.values[name]) for name in FIGURES), *products)
 
 
-def _residuals(found: Prediction, test: PilotTest) -> dict[str, np.ndarray]:
-    """Return by what each measured quantity is missed, in percent passing or percent."""
+def _residuals(said: Prediction, test: PilotTest) -> dict[str, np.ndarray]:
+    """Return by what each measured quantity is missed, percent passing or percent; of power beside the net power."""
     off = {}
-    for name in _PARTS:
-        part, measured = getattr(found, name), getattr(test, name)
-        if part is not None and not np.isnan(measured).all():
-            off[name] = 100 * (part - measured)
-    for name, value in (("throughput", found.throughput), ("power", found.power), ("cake_thickness", found.gap)):
-        measured = getattr(test, name)
-        if not math.isnan(measured):
-            off[name] = np.array([100 * (value / measured - 1)])
+    for name in (*PARTS, *_OF_MACHINE):
+        missed, _ = _both(said, test, name)
+        if missed.size:
+            idle = test.idle_power if name == "power" and not math.isnan(test.idle_power) else 0.0
+            off[name] = 100 * missed / (1.0 if name in PARTS else measured(test, name) - idle)
     return off
 
 
 def _started(scene: Scene, names: Sequence[str], test: PilotTest, feed: Feed | None) -> Scene:
-    """Return the scene with starting values that a test tells by itself: nip angle, moduli, strength."""
-    cake = test.gap if math.isnan(test.cake_thickness) else test.cake_thickness
-    if math.isnan(cake):
-        return scene
-    if "alpha" in names and not math.isnan(test.throughput):
-        bed = scene.bed
-        solid = test.throughput / (bed.solid_density * cake * scene.rolls.width * test.surface_speed)
-        if bed.feed_solid_fraction < solid <= bed.max_solid_fraction:  # else the working gap was no cake's thickness
-            values = {"rolls.gap": cake, "flow.cake_solid_fraction": solid, "flow.nip_angle": None}
-            angle = _nip_angle(scene.with_values(values | {"rolls.specific_pressing_force": 1.0}))
-            scene = scene.with_values({"flow.nip_angle": angle, "flow.cake_solid_fraction": None})
-    here = _at_test(scene, test, feed, floating=False).with_values({"resolution.cells": 0})
+    """Return the scene with starting values that a test tells by itself: moduli that carry its force, and strength."""
+    for name, usual in (("k", 1.0), ("n", 1.0)):
+        if name in names and math.isinf(_field(scene, PARAMETERS[name].field)):
+            scene = scene.with_values({PARAMETERS[name].field: usual})
+    here = _at_test(scene, test, feed)
+    rolls, bed = here.rolls, here.bed
+    through = test.throughput / (_SOLID * bed.solid_density * rolls.width * test.surface_speed)
+    gap = next(one for one in (float(measured(test, "gap")[0]), through, _GAP * rolls.diameter) if not math.isnan(one))
+    densest = here.elasticity.densest(bed.max_solid_fraction)
+    narrowest, _ = here.flow.narrowest_gap(rolls.diameter, bed.feed_solid_fraction, densest)
+    values = {"rolls.gap": max(gap, 1.05 * narrowest), "rolls.specific_pressing_force": None, "resolution.cells": 0}
+    here = here.with_values(values)
     if "K" in names:
-        force = machine.specific_pressing_force(here)  # proportional to the moduli
-        if force > 0:
+        for _ in range(8):  # the force is near proportional to the moduli
+            force = machine.specific_pressing_force(here)
+            if not 0 < force < math.inf:
+                break
             factor = test.specific_pressing_force / force
-            stiffer = {f"elasticity.{name}": factor * getattr(scene.elasticity, name) for name in _MODULI}
+            stiffer = {one: factor * _field(here, one) for one in (PARAMETERS["K"].field, PARAMETERS["K"].follower)}
             scene, here = scene.with_values(stiffer), here.with_values(stiffer)
     if "sigma_m" in names:
         pressure = float(solve.crushing_stress(*load(here)).max())
-        critical = float(np.interp(_CRITICAL, test.total, test.sizes))
+        known = ~np.isnan(test.total)
+        critical = float(np.interp(_CRITICAL, test.total[known], test.sizes[known]))
         slope = 3 / scene.strength.weibull_modulus
         if pressure > 0:
             strength = pressure * (critical / scene.strength.reference_size) ** slope
@@ -374,129 +567,26 @@ def _started(scene: Scene, names: Sequence[str], test: PilotTest, feed: Feed | N
     return scene
 
 
-def _best_start(function, start: np.ndarray, bounds: np.ndarray, free: list[int], cushioning: int) -> np.ndarray:
-    """Return the best of the minima reached from several strengths of cushioning: the valley is shallow and bent."""
-    found = []
-    for value in _CUSHIONINGS:
-        place = start.copy()
-        place[cushioning] = PARAMETERS["n"].scaled(value)
-        found.append(_minimise(function, place, bounds, free, _STEPS[:1]))
-    return min(found, key=lambda place: float(np.sum(function(place) ** 2)))
-
-
-def _minimise(function, start: np.ndarray, bounds: np.ndarray, free, steps) -> np.ndarray:
-    """Return the place of the least squares over the free numbers, with ever narrower differences."""
-    place = start.copy()
-    if not free:
-        return place
-
-    def at(part: np.ndarray) -> np.ndarray:
-        whole = place.copy()
-        whole[free] = part
-        return whole
-
-    for step in steps:
-
-        def slopes(part: np.ndarray, step: float = step) -> np.ndarray:
-            return _slopes(function, at(part), bounds, free, step)
-
-        limits = {"bounds": bounds[:, free], "xtol": 1e-4, "ftol": 1e-5, "max_nfev": 40}
-        place = at(least_squares(lambda part: function(at(part)), place[free], slopes, **limits).x)
-    return place
-
-
-def _slopes(function, place: np.ndarray, bounds: np.ndarray, free, step: float) -> np.ndarray:
-    """Return the derivatives (residual, free) by central differences that stay within the bounds."""
-    columns = []
-    for k in free:
-        ends = [place.copy(), place.copy()]
-        ends[0][k], ends[1][k] = max(place[k] - step, bounds[0, k]), min(place[k] + step, bounds[1, k])
-        low, high = (function(end) for end in ends)
-        columns.append((high - low) / (ends[1][k] - ends[0][k]))
-    return np.array(columns).T
-
-
-def _calibration(trial: _Trial, place: np.ndarray, bounds: np.ndarray, parts) -> Calibration:
-    """Return what was found; `parts` are the functions minimised with the numbers that each was free in."""
-    names, spread, lost = trial.names, np.zeros(place.size), np.zeros(place.size, bool)
-    for function, free in parts:
-        if free:
-            spread[free], lost[free] = _spread(function(place), _slopes(function, place, bounds, free, _STEPS[0]))
-    estimates = {}
-    for k, name in enumerate(names):
-        parameter = PARAMETERS[name]
-        ends = (parameter.value(min(max(place[k] + side * spread[k], -700.0), 700.0)) for side in (-1, 1))
-        low, high = ends if math.isfinite(spread[k]) else (0.0, math.inf)
-        estimates[name] = Estimate(parameter.value(place[k]), max(low, 0.0), high, field_info(parameter.field).unit)
-    values = _values(trial.scene, names, place)
-    fitted = [one.with_values(values) for one in trial.cases]
-    close = 1e-3 * (bounds[1] - bounds[0])
-    return Calibration(
-        fitted[0],
-        estimates,
-        {test.name: _residuals(_predict(one), test) for one, test in zip(fitted, trial.tests, strict=True)},
-        tuple(name for k, name in enumerate(names) if min(place[k] - bounds[0, k], bounds[1, k] - place[k]) < close[k]),
-        tuple(name for name, k in zip(names, lost, strict=True) if k),
-    )
-
-
-def _spread(residual: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return half the width of each confidence interval, and which numbers the tests do not determine."""
-    from scipy.stats import t  # late: importing it costs 0.3 s
-
-    _, singular, axes = np.linalg.svd(slopes, full_matrices=False)
-    told = singular > _UNDETERMINED * singular[0]
-    freedom = residual.size - singular.size
-    if freedom == 0:  # as many values as numbers: met exactly, with no telling how well
-        return np.full(singular.size, math.inf), np.zeros(singular.size, bool)
-    variance = residual @ residual / freedom
-    inverse = np.where(told, 1 / np.where(told, singular, 1.0), 0.0)
-    spread = t.ppf((1 + _CONFIDENCE) / 2, freedom) * np.sqrt(variance * ((inverse[:, None] * axes) ** 2).sum(axis=0))
-    lost = (np.abs(axes[~told]) > 0.1).any(axis=0) if not told.all() else np.zeros(singular.size, bool)
-    return np.where(lost, math.inf, spread), lost
-
-
-def _more_values(scene: Scene, what: str) -> str:
-    """Return what to do where there are fewer values than parameters."""
-    if what == _PRODUCT and not scene.resolution.cells:
-        return "resolution.cells = 0 has no product to compare: give the scene cells"
-    return "fit fewer, or give more tests"
-
-
-def _known_names(scene: Scene, fit: Sequence[str]) -> list[str]:
+def _known_names(scene: Scene, fit: Sequence[str] | None) -> list[str]:
+    kind = None if scene.roll_width is None else scene.roll_width.kind
+    lacking = {
+        "alpha": "flow.kind = 'nip'" * (scene.flow.kind != "nip"),
+        "kappa": "roll_width.kind = 'parabola'" * (kind != "parabola"),
+        "epsilon": "roll_width.kind = 'friction_hill'" * (kind != "friction_hill"),
+    }
+    if fit is None:
+        return [name for name in FIT if not lacking.get(name)]
     names = list(dict.fromkeys(fit))
     unknown = [name for name in names if name not in PARAMETERS]
     if unknown or not names:
         told = ", ".join(unknown) or "nothing"
         raise ValueError(f"fit: got {told}; must be among {', '.join(PARAMETERS)}; correct the symbols, or name some")
-    if "alpha" in names and scene.flow.kind != "nip":
-        raise ValueError("fit: got alpha; must be fitted with flow.kind = 'nip'; leave it out or take that flow")
-    if "kappa" in names and scene.roll_width is None:
-        raise ValueError("fit: got kappa; must be fitted with a roll_width; leave it out or give the scene one")
+    for name in names:
+        if lacking.get(name):
+            raise ValueError(f"fit: got {name}; must be fitted with {lacking[name]}; leave it out, or change the scene")
     return names
 
 
-def _nip_angle(scene: Scene) -> float:
-    return scene.flow.angle(scene.rolls.gap, scene.rolls.diameter, scene.bed.feed_solid_fraction)
-
-
-def _value_of(scene: Scene, name: str) -> float:
-    """Return the value to start from."""
-    if name == "alpha":
-        return _nip_angle(scene)
-    part, key = PARAMETERS[name].field.split(".")
-    value = getattr(getattr(scene, part), key)
-    return min(max(value, PARAMETERS[name].low), PARAMETERS[name].high if name != "n" else 1.0)
-
-
-def _values(scene: Scene, names: Sequence[str], scaled: np.ndarray) -> dict[str, Any]:
-    """Return the scene fields of fitted numbers, followers included."""
-    values = {}
-    for name, number in zip(names, scaled, strict=True):
-        parameter = PARAMETERS[name]
-        values[parameter.field] = parameter.value(float(number))
-        if parameter.follower:
-            part, key = parameter.follower.split(".")
-            ratio = getattr(getattr(scene, part), key) / _value_of(scene, name)
-            values[parameter.follower] = ratio * values[parameter.field]
-    return values
+def _field(scene: Scene, name: str) -> float:
+    part, key = name.split(".")
+    return getattr(getattr(scene, part), key)

@@ -195,6 +195,11 @@ class PilotTest(NamedTuple):
     specific_energy: float  # J kg-1
     hydraulic_pressure: float  # Pa
     moisture: float  # fraction
+    diameter: float  # of the rolls, m; NaN of this and the next three: as in the scene
+    width: float  # of the rolls, m
+    solid_density: float  # kg m-3
+    idle_power: float  # of both rolls without feed, W
+    cake_density: float  # of the flake as weighed, kg m-3
     sizes: np.ndarray  # sieves, m, rising
     feed: np.ndarray  # fraction passing
     centre: np.ndarray  # fraction of the product from the middle of the rolls passing
@@ -229,6 +234,11 @@ _OPERATIONS = {
     "W_kWh_t": _Column("specific_energy", 3600.0),
     "Rp_bar": _Column("hydraulic_pressure", 1e5),
     "moisture_pct": _Column("moisture", 1e-2, open_below=False, most=100.0),
+    "D_mm": _Column("diameter", 1e-3),
+    "L_mm": _Column("width", 1e-3),
+    "solid_t_m3": _Column("solid_density", 1e3),
+    "P_idle_kW": _Column("idle_power", 1e3, open_below=False),
+    "flake_density_t_m3": _Column("cake_density", 1e3),
 }
 _PRODUCT = {
     "size_mm": _Column("sizes", 1e-3, required=True),
@@ -255,8 +265,9 @@ def read_pilot_tests(product: str | Path, operations: str | Path) -> tuple[Pilot
         measured, `centre` and `edge`.
     operations
         One row per test: `test`, `U_m_s` (surface speed), `Fsp_N_mm2` (specific pressing force) and,
-        where measured, `gap_mm`, `flake_mm`, `Q_tph`, `mdot` (t s h-1 m-3), `P_kW`, `W_kWh_t`, `Rp_bar`,
-        `moisture_pct`.
+        where measured, `gap_mm`, `flake_mm`, `Q_tph`, `mdot` (t s h-1 m-3), `P_kW` (the whole draw), `P_idle_kW` (that
+        without feed), `W_kWh_t`, `Rp_bar`, `moisture_pct`, and of the machine and ore `D_mm`, `L_mm` (roll diameter and
+        width), `solid_t_m3`, `flake_density_t_m3`.
 
     Columns and rows may stand in any order; an empty cell is "not measured"; other columns are refused.
     Lines starting with # are comments. Nothing is derived: a specific energy that is not in the table is

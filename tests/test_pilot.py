@@ -1,5 +1,4 @@
 import csv
-import math
 
 import numpy as np
 import pytest
@@ -14,19 +13,18 @@ from studies.pilot import main
 FORCES = {"A": 2.5, "B": 3.7, "C": 4.7}  # N/mm2
 SIZES = [0.125, 0.5, 1.0, 2.8, 5.6, 11.2, 16.0, 22.4, 31.5, 45.0]  # mm
 PRODUCT, OPERATIONS = presets.DATA / "khd_porphyry_psd.csv", presets.DATA / "khd_porphyry_operations.csv"
-GRID = ["--streamlines", "1", "--points", "40", "--cells", "300"]
-FIT = ["--fit", "sigma_m", "w", "gamma", "K", "alpha", "kappa", "T_0"]  # without n: the closed form, which is quick
-PLANTED = {
-    "strength.cushioning": math.inf,
-    "strength.reference_strength": 3e6,
-    "strength.weibull_modulus": 1.5,
-    "fragments.exponent": 0.4,
-    "rolls.idle_torque": 4000.0,
+GRID = ["--points", "40"]
+FIT = ["--fit", "sigma_m", "gamma", "K", "alpha", "epsilon"]
+PLANTED = pilot.START | {
+    "elasticity.bulk_modulus": 42e6,
+    "elasticity.shear_modulus": 19.5e6,
+    "strength.reference_strength": 0.6e6,
+    "fragments.exponent": 0.7,
+    "fragments.size_exponent": 1.0,
     "resolution.record": "product",
     "resolution.streamlines": 1,
     "resolution.points": 40,
-    "resolution.cells": 300,
-    "roll_width": {"pressure_drop": 0.7, "edge_share": 0.22, "slices": 2},
+    "roll_width": {"kind": "friction_hill", "edge_ratio": 0.15, "edge_share": 0.22, "slices": 2},
 }
 
 
@@ -53,7 +51,7 @@ def written(folder, truth):
         )
         made = predict(truth, blank)
         for k, size in enumerate(SIZES):
-            parts = (100 * part[k] for part in (share, made.centre, made.edge, made.total))
+            parts = (100 * min(part[k], 1.0) for part in (share, made.centre, made.edge, made.total))
             rows.append([name, size, *parts])
         runs.append([name, 0.5, force, made.gap * 1e3, made.throughput * 3.6, made.power / 1e3])
     for path, header, body in (
@@ -76,12 +74,16 @@ def test_tests_that_the_model_has_made_are_predicted_blind(written, capsys):
     assert result["test"].values.tolist() == list("ABC")
     assert result["blind"].values.tolist() == [0, 0, 1]
     blind = result.sel(test="C", source="hpgr")
-    assert float(blind["rmse"].max()) < 0.1  # percent passing
+    assert float(blind["rmse"].max()) < 0.5  # percent passing; slices are four, not the truth's two
     for name in pilot.FIGURES:
         measured = result[name].sel(test="C", source="measured")
-        assert float(blind[name] / measured) == pytest.approx(1, abs=2e-3), name
+        assert float(blind[name] / measured) == pytest.approx(1, abs=1e-2), name
+        assert blind[f"{name}_lower"] < blind[name] < blind[f"{name}_upper"]
+    assert np.all(blind["passing_lower"] <= blind["passing_upper"])
+    assert result["fragments.exponent"].dims == ("sample",)
+    assert float(result["fragments.exponent"].std()) > 0
     assert "hpgr: median" in out
-    for symbol, unit in (("sigma_m", "MPa"), ("alpha", "deg"), ("T_0", "kN m")):
+    for symbol, unit in (("sigma_m", "MPa"), ("alpha", "deg")):
         assert any(symbol in line and unit in line for line in out.splitlines()), symbol
     assert (xr.open_dataset("outputs/pilot.nc").attrs["models"]).startswith("hpgr: calibrated on A, B")
 
@@ -100,7 +102,8 @@ def test_tests_without_parts_and_power(written, folder, capsys):
             csv.writer(file).writerows([kept, *([row[name] for name in kept] for row in rows)])
     assert main([*written, "--calibrate-on", "A", "B", "--no-plot", "--no-baselines"]) == 0
     out = capsys.readouterr().out
-    assert "fitting sigma_m, w, gamma, K, alpha to A, B" in out
+    assert "fitting to A, B" in out
+    assert any(line.strip().startswith("epsilon = ") for line in out.splitlines())
     with xr.open_dataset("outputs/pilot.nc") as result:
         one = result.sel(source="hpgr", test="C")
         assert np.isnan(one["rmse"].sel(part="edge"))
@@ -110,11 +113,11 @@ def test_tests_without_parts_and_power(written, folder, capsys):
 @pytest.mark.slow
 def test_force_that_no_gap_carries_loses_its_test_only(written, folder, capsys):
     runs = folder / "runs.csv"
-    runs.write_text(runs.read_text().replace("C,0.5,4.7", "C,0.5,900"))
+    runs.write_text(runs.read_text().replace("C,0.5,4.7", "C,0.5,0.001"))
     assert main([*written, "--calibrate-on", "A", "B", "--no-plot", "--no-baselines"]) == 0
     assert "reachable" in capsys.readouterr().out
     with xr.open_dataset("outputs/pilot.nc") as result:
-        assert "900 MPa" in str(result["failure"].sel(source="hpgr", test="C").values)
+        assert "0.001 MPa" in str(result["failure"].sel(source="hpgr", test="C").values)
         assert np.isnan(result["throughput"].sel(source="hpgr", test="C"))
         assert np.isfinite(result["throughput"].sel(source="hpgr", test="B"))
 
@@ -124,7 +127,6 @@ def test_force_that_no_gap_carries_loses_its_test_only(written, folder, capsys):
     [
         (["--calibrate-on", "K-P9"], ["--calibrate-on", "K-P9", "K-P1, K-P2"]),
         (["--tests", "none.csv"], ["cannot read none.csv: No such file", "--tests"]),
-        (["--cells", "0"], ["--cells", "at least 1"]),
         (["--fit", "sigma"], ["fit", "sigma", "sigma_m"]),
     ],
 )
@@ -138,14 +140,44 @@ def test_bad_input_is_refused(arguments, words, capsys, folder):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not COMPILED, reason="takes minutes without the compiler")
-def test_porphyry_is_predicted_within_the_stated_errors(capsys):
-    """The figures of docs/validation.md, to the digits that matter there."""
-    assert main(["--no-plot", "--no-baselines"]) == 0
+@pytest.mark.parametrize(
+    ("series", "known", "blind", "median", "largest"),
+    [
+        ("khd_porphyry", ["K-P1", "K-P3"], ["K-P2", "K-P4", "K-P5", "K-P6", "K-P7"], 1.5, 3.7),
+        ("ubc_iron_ore", ["U-IO1", "U-IO3"], ["U-IO2", "U-IO4", "U-IO5", "U-IO6"], 3.0, 3.6),
+    ],
+)
+def test_tests_are_predicted_within_the_stated_errors(series, known, blind, median, largest):
+    """The figures of docs/validation.md, to the digits that matter there; the iron ore's feed is another one."""
+    files = ["--tests", str(presets.DATA / f"{series}_psd.csv")]
+    files += ["--operations", str(presets.DATA / f"{series}_operations.csv")]
+    assert main([*files, "--calibrate-on", *known, "--no-plot", "--no-baselines"]) == 0
     with xr.open_dataset("outputs/pilot.nc") as result:
-        blind = result.sel(source="hpgr", test=["K-P2", "K-P4", "K-P5"])
-        total = blind["rmse"].sel(part="total")
-        assert float(total.median()) < 2.5
-        assert float(total.max()) < 5
-        for name in ("throughput", "power"):
-            measured = result[name].sel(source="measured", test=blind["test"].values)
-            assert float(abs(blind[name] / measured - 1).max()) < 0.1, name
+        one = result.sel(source="hpgr", test=blind)
+        total = one["rmse"].sel(part="total")
+        assert float(total.median()) < median
+        assert float(total.max()) < largest
+        off = abs(one["throughput"] / result["throughput"].sel(source="measured", test=blind) - 1)
+        assert float(off.max()) < 0.09
+        if series == "khd_porphyry":  # net power; the iron ore's other feed has a bed of its own
+            assert float(off.max()) < 0.055
+            assert float(abs(one["power"] / result["power"].sel(source="measured", test=blind) - 1).max()) < 0.08
+
+
+@pytest.mark.slow
+def test_laws_are_compared_by_leaving_out(written, capsys, monkeypatch):
+    """On tests that the model has made, its own laws miss nothing; a threshold in place of the scatter does."""
+    laws = [pilot.Laws("own", {}, FIT[1:]), pilot.Laws("threshold", pilot._THRESHOLD, FIT[1:])]
+    monkeypatch.setattr(pilot, "COMBINATIONS", laws)
+    assert main([*written, "--compare", "--no-plot", "--no-baselines"]) == 0
+    out = capsys.readouterr().out
+    with xr.open_dataset("outputs/pilot.nc") as result:
+        error = result["error"].load()
+        assert result["constants"].values.tolist() == [0, 5, 5]
+    largest = error.sel(figure="total_largest")
+    assert (largest.sel(laws="own") < 0.6).all()
+    assert largest.sel(laws="threshold", left_out=1) > 1
+    exponent = error.sel(figure="gap_exponent", left_out=0)
+    assert float(exponent.sel(laws="own")) == pytest.approx(float(exponent.sel(laws="measured")), abs=0.02)
+    assert 0 < float(error.sel(laws="own", left_out=1, figure="width")) < 20
+    assert "leave 2 out" in out

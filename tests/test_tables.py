@@ -102,7 +102,7 @@ def refused(tmp_path, product=PRODUCT, operations=OPERATIONS):
 def test_shipped_pilot_tests_are_the_published_ones():
     data = files("hpgr") / "data"
     tests = tables.read_pilot_tests(data / "khd_porphyry_psd.csv", data / "khd_porphyry_operations.csv")
-    assert [test.name for test in tests] == ["K-P1", "K-P2", "K-P3", "K-P4", "K-P5"]
+    assert [test.name for test in tests] == [f"K-P{number}" for number in range(1, 8)]
     assert {len(test.sizes) for test in tests} == {13}
     fourth = tests[3]
     assert fourth[1:11] == pytest.approx(

@@ -28,18 +28,18 @@ def pilot_figure(result: xr.Dataset) -> Figure:
     figure_errors(panels[tests.size], result, sources)
     for panel in panels[tests.size + 1 :]:
         panel.set_axis_off()
+    seen = [part for part in _MARKERS if result["passing"].sel(source="measured", part=part).notnull().any()]
     parts = [
         Line2D([], [], marker=mark, color=_colour(k), linestyle="none", label=f"measured, {part}")
         for k, (part, mark) in enumerate(_MARKERS.items())
+        if part in seen
     ]
     lines = [
-        Line2D([], [], color="0.3", linestyle=_LINES[k % len(_LINES)], label=name)
-        for k, name in enumerate(sources)
-        if _drawn(name)
+        Line2D([], [], color="0.3", linestyle=_LINES[k % len(_LINES)], label=name) for k, name in enumerate(sources)
     ]
     figure.legend(handles=parts + lines, loc="outside upper center", ncols=4, fontsize=9)
     figure.supxlabel(
-        "Lines: predicted; centre and edge are of the roll width. The other models are drawn for the total only.",
+        "Lines: predicted, with 90 % intervals; centre and edge are of the roll width. Other models: the total only.",
         fontsize=9,
     )
     return figure
@@ -52,12 +52,15 @@ def distributions(panel, one: xr.Dataset, sources: list[str]) -> None:
         measured = 100 * one["passing"].sel(source="measured", part=part).values
         panel.plot(sieves, measured, mark, color=_colour(k), markersize=4.5)
         for j, name in enumerate(sources):
-            if j == 0 or (part == "total" and _drawn(name)):
+            if j == 0 or part == "total":
                 values = 100 * one["passing"].sel(source=name, part=part).values
                 seen = np.isfinite(values)
                 panel.plot(sieves[seen], values[seen], _LINES[j % len(_LINES)], color=_colour(k), linewidth=1.2)
+        ends = [100 * one[f"passing_{side}"].sel(source=sources[0], part=part).values for side in ("lower", "upper")]
+        panel.fill_between(sieves, *ends, where=np.isfinite(ends[0]), color=_colour(k), alpha=0.15, linewidth=0)
     told = "blind" if one["blind"].item() else "fitted"
-    errors = ", ".join(f"{part} {one['rmse'].sel(source=sources[0], part=part).item():.1f}" for part in _MARKERS)
+    rmse = {part: one["rmse"].sel(source=sources[0], part=part).item() for part in _MARKERS}
+    errors = ", ".join(f"{part} {value:.1f}" for part, value in rmse.items() if np.isfinite(value)) or "none"
     panel.set_title(f"{one['test'].item()} ({told}); RMSE {errors}", fontsize=10)
     panel.set(xscale="log", xlabel="sieve [mm]", ylabel="passing [%]", ylim=(0, 103))
     panel.grid(color="0.9", which="both")
@@ -95,11 +98,6 @@ def figure_errors(panel, result: xr.Dataset, sources: list[str]) -> None:
     panel.set_title(f"full: {sources[0]}; hollow: other models; dotted: 10 %", fontsize=10)
     panel.legend(fontsize=8)
     panel.grid(color="0.9")
-
-
-def _drawn(source: str) -> bool:
-    """Whether a model's size distributions are drawn: with the gap given they crowd the others."""
-    return "gap given" not in source
 
 
 def _colour(k: int):
