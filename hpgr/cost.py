@@ -51,11 +51,14 @@ def predict(scene: Scene) -> Cost:
         size += (12 if slices == 1 else 38) * product  # kept, pooled, sorted; with slices ordered by their shares
         size += 40 * cells * min(columns * grid.snapshots, at_once)  # work space
         seconds += product * (0.2e-6 + 0.15e-9 * points)
-    if solver == "lattice":
+    if solver.endswith("lattice"):
         steps = points + grid.snapshots * exchange.interval
         frames += -(-(points - 1) // exchange.interval) if exchange.record_startup else 0
         size += 24 * lines * points * cells + 10_000 * lines * points  # parcels; edges of the tessellation
-        seconds += 5e-5 * lines * points + steps * lines * points * (2e-6 + 3e-9 * cells)
+        below = (
+            1.0 if solver == "lattice" else 0.1
+        )  # of parcels and steps, squared: the reduced lattice begins far down
+        seconds += 5e-5 * lines * points + below * steps * lines * points * (2e-6 + 3e-9 * cells)
     if cells and grid.record == "cells":
         size += 4 * frames * lines * points * cells
         seconds += 1e-9 * frames * lines * points * cells

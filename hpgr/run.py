@@ -44,7 +44,7 @@ def load(scene: Scene, beds: Beds | None = None) -> tuple[Scene, LoadedBed]:
         If no gap carries the pressing force, or material points coincide.
     """
     scene = machine.float_gap(scene)
-    inputs = inputs_of(scene, tessellated=solve.choose(scene) == "lattice")
+    inputs = inputs_of(scene, tessellated=solve.choose(scene).endswith("lattice"))
     return scene, load_bed(inputs) if beds is None else beds.load(inputs)
 
 

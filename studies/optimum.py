@@ -161,7 +161,8 @@ class _Search:
         self.traded = [fineness, quantity_of("specific energy"), quantity_of("throughput")]
         self.every = list(dict.fromkeys([*self.asked, *self.traded]))
         self.own, self.scene, self.beds = scene, with_sieves(scene, self.every), Beds(4)
-        random = solve.choose(self.scene) in ("march", "lattice") and any(one.of_product for one in self.asked)
+        drawn = solve.choose(self.scene) not in ("stress only", "closed form")
+        random = drawn and any(one.of_product for one in self.asked)
         self.replicates, self.judges = (_REPLICATES, _JUDGES) if random else (1, 1)
         self.bounded = [self.every.index(limit.quantity) for limit in limits]
         self.free, self.known, self.scales = list(ends), {}, np.ones(len(self.every))

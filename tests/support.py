@@ -8,7 +8,7 @@ import numpy as np
 
 from hpgr import presets
 from hpgr.grains import kernels, solve
-from hpgr.grains.kernels import Path, Record
+from hpgr.grains.kernels import Passage, Path
 from hpgr.grains.march import ore
 from hpgr.laws.fragments import Fragments
 from hpgr.laws.strength import Strength
@@ -73,23 +73,34 @@ def laws(w=3.04, n=1.0, gamma=1.0, reference_size=0.06, floor=1e-6, k=math.inf, 
     return SimpleNamespace(strength=strength, fragments=fragments)
 
 
-def march(sizes, streams, log_stress, sieves=(), every=False, kernel=kernels.march, **constants):
+def march(sizes, streams, log_stress, sieves=(), every=False, kernel=kernels.crush, **constants):
     """March copies of a line through a stress history.
 
     Returns
     -------
     (sizes, streams, breaks), and with `every` also (sizes, classes) after every step.
     """
-    given, log_stress = laws(**constants), np.asarray(log_stress, float)
-    padded = [np.pad(part, 1)[None] for part in (sizes, streams)]
-    sieves, steps = np.asarray(sieves, float), log_stress.size
-    snapshots = np.empty((1, steps, sizes.size) if every else (0, 0, 0), np.float32)
-    classes = np.empty((1, steps, sieves.size + 1) if every and sieves.size else (0, 0, 0), np.int64)
+    given, log_stress, cells = laws(**constants), np.asarray(log_stress, float), sizes.size
+    parcels = kernels.make_parcels(1, cells, scattered=math.isfinite(given.strength.scatter))
+    parcels.sizes[0, 1:-1], parcels.streams[0, 1:-1] = sizes, streams
+    if parcels.weakness.size:
+        parcels.weakness[0, 1:-1] = weakness(given.strength, streams)
+    snapshots = (1, log_stress.size, cells) if every else (0, 0, 0)
+    classes = (1, log_stress.size, len(sieves) + 1) if every and len(sieves) else (0, 0, 0)
+    record = kernels.make_record(sieves, snapshots, classes)
     path = Path(log_stress[None], given.strength.critical_size_ratio(log_stress)[None])
-    breaks = np.empty(1, np.int64)
-    kernel(*padded, np.zeros(1, int), path, ore(given), Record(sieves, snapshots, classes), breaks)
-    found = padded[0][0, 1:-1], padded[1][0, 1:-1], int(breaks[0])
-    return (*found, snapshots.reshape(-1, sizes.size), classes.reshape(-1, sieves.size + 1)) if every else found
+    passage = Passage(*np.array([[0], [0], [0], [log_stress.size]]))
+    kernel(parcels, passage, path, ore(given), kernels.make_work(cells), record)
+    found = parcels.sizes[0, 1:-1], parcels.streams[0, 1:-1], int(parcels.breaks[0])
+    kept = record.snapshots.reshape(-1, cells), record.classes.reshape(-1, len(sieves) + 1)
+    return (*found, *kept) if every else found
+
+
+def weakness(strength, streams):
+    """What scattered strength makes of the effective sizes of cells, by the number after each stream's last."""
+    numbers = [((split_mix(split_mix(int(state))) >> 12) + 0.5) / 2**52 for state in streams]
+    scale = 3 / strength.weibull_modulus or 1.0
+    return np.clip(strength.zeta(np.array(numbers)) ** (-1 / scale), 1e-30, 1e30).astype(np.float32)
 
 
 def critical_log_stress(critical, w=3.04, reference_size=0.06):
@@ -118,8 +129,9 @@ def crush(scene, stress, seed=0, replicate=0):
 
 def draw(feed, cells, source):
     """Sizes of a parcel as the package draws them, from a SeedSequence."""
-    uniforms = np.empty((1, cells))
-    kernels.start_parcels(source.generate_state(2, np.uint64)[None], uniforms, np.empty((1, cells + 2), np.uint64))
+    uniforms, nothing = np.empty((1, cells)), np.empty((1, 0), np.float32)
+    bases = source.generate_state(2, np.uint64)[None]
+    kernels.start_parcels(bases, ore(laws()), uniforms, np.empty((1, cells + 2), np.uint64), nothing)
     return feed.quantile(uniforms[0]).astype(np.float32)
 
 

@@ -19,6 +19,7 @@ from support import (
     sized,
     split_mix,
     streams,
+    weakness,
 )
 
 from hpgr.grains import kernels
@@ -30,26 +31,22 @@ MASK = 2**64 - 1
 # --- the plain reference -----------------------------------------------------------------------------------
 
 
-def uniform_of(state):
-    return ((split_mix(state) >> 12) + 0.5) / 2**52
-
-
 def reference(sizes, streams, log_stress, **constants):
     """The march of the model page, section 4, by the laws' own equations: every cell is looked at in every step."""
     sizes, states, breaks, every = sizes.copy(), [int(state) for state in streams], 0, []
     law = laws(**constants)
     scale = 3 / law.strength.weibull_modulus or 1.0
 
-    def log_zeta(state):  # by the number after the one that the fragment was drawn by, rounded as it is stored
-        weakness = law.strength.zeta(uniform_of(split_mix(state))) ** (-1 / scale)
-        return -scale * math.log(np.float32(np.clip(weakness, 1e-30, 1e30)))
+    def log_zeta(state):
+        return -scale * math.log(weakness(law.strength, [state])[0])
 
     scattered = np.array([log_zeta(state) for state in states])
     for level in log_stress:
         strength = law.strength.log_strength(sizes) + scattered
         for p in np.flatnonzero((level >= strength) & (sizes.astype(float) >= law.fragments.size_floor)):
             states[p] = (states[p] + GOLDEN) & MASK
-            ratio = law.fragments.quantile(uniform_of(states[p]), float(sizes[p]))
+            uniform = ((split_mix(states[p]) >> 12) + 0.5) / 2**52
+            ratio = law.fragments.quantile(uniform, float(sizes[p]))
             sizes[p] = np.float32(max(float(sizes[p]) * float(ratio), 1e-30))
             scattered[p] = log_zeta(states[p])
             breaks += 1
@@ -272,7 +269,7 @@ def half_every_time(monkeypatch):
     monkeypatch.setattr(kernels, "_list_above", kernels._plain_list_above)
     monkeypatch.setattr(kernels, "_largest", kernels._plain_largest)
     monkeypatch.setattr(kernels, "uniform", lambda state: 0.5)
-    return plain(kernels.march)
+    return plain(kernels.crush)
 
 
 @pytest.mark.parametrize("critical", [0.05, 0.011, 0.0003])

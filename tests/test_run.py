@@ -412,7 +412,7 @@ def test_stress_only_does_no_cell_work(monkeypatch):
     def refuse(*args, **kwargs):
         raise AssertionError("cell work")
 
-    for room, name in ((kernels, "march"), (kernels, "start_parcels"), (closed_form, "crushed_passing")):
+    for room, name in ((kernels, "crush"), (kernels, "start_parcels"), (closed_form, "crushed_passing")):
         monkeypatch.setattr(room, name, refuse)
     ds = simulate(paper({"resolution.cells": 0}))
     cells_only = {name for name, entry in schema.VARIABLES.items() if {"cell", "sieve"} & set(entry.dims)}

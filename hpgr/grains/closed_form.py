@@ -44,7 +44,7 @@ def _cascade(feed: Feed, strength: Strength, fragments: Fragments, critical: np.
     that enter, the part b (1 - exp(-a)) / a, a = gamma (1 - b) h, then leaves it in the end.
     """
     top = math.log(feed.largest_grain)
-    lowest = math.log(fragments.size_floor * _BELOW_FLOOR)
+    lowest = min(math.log(fragments.size_floor * _BELOW_FLOOR), top - 1)  # of a feed below the floor nothing breaks
     edges = np.linspace(lowest, top, math.ceil((top - lowest) * _CLASSES))
     width, middle = edges[1] - edges[0], np.exp((edges[1:] + edges[:-1]) / 2)[:, None]
     gamma = fragments.exponent_of(middle)

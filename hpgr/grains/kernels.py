@@ -27,7 +27,12 @@ from hpgr.laws.fragments import HELD, POWER_LAW
 from hpgr.laws.strength import SIZE_EFFECT
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy")
-_inlined = njit(cache=True, nogil=True, error_model="numpy", forceinline=True)  # handing arrays over costs as much
+# Functions that Python does not call need no wrappers, which cost most of the time to compile; and handing the arrays
+# of a step over costs as much as a short loop
+_inner = njit(cache=True, nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+_inlined = njit(
+    cache=True, nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True
+)
 
 BLOCK = 16  # cells; as many as the vectors below
 DENSE = 1 / 64  # swap probability of an edge from which deciding every cell is cheaper than skipping
@@ -59,29 +64,42 @@ class Ore(NamedTuple):
 
 
 class Parcels(NamedTuple):
-    """Lines of cells, (slot, ...), or one of them."""
+    """Lines of cells, (slot, ...)."""
 
-    sizes: np.ndarray  # float32 (cell + 2,), m
-    streams: np.ndarray  # uint64 (cell + 2,), state of each cell's random stream
-    weakness: np.ndarray  # float32 (cell + 2,), what a grain's own strength makes of its effective size; (0,): 1
-    unshielded: np.ndarray  # float32 (cell + 2,), bounds of cells that nothing is known of but themselves
-    bounds: np.ndarray  # float32 (block x BLOCK + 2,), upper bounds of effective size over s_m
-    block_bounds: np.ndarray  # float32 (block, to the next BLOCK), the largest in each block
+    sizes: np.ndarray  # float32 (slot, cell + 2), m
+    streams: np.ndarray  # uint64 (slot, cell + 2), state of the random stream of each place
+    weakness: np.ndarray  # float32 (slot, cell + 2), by which a grain's own strength multiplies its effective size,
+    # or (slot, 0) where strengths do not scatter
+    unshielded: np.ndarray  # float32 (slot, cell + 2), bounds of cells that nothing is known of but themselves
+    bounds: np.ndarray  # float32 (slot, block x BLOCK + 2), upper bounds of effective size over s_m
+    block_bounds: np.ndarray  # float32 (slot, block, to the next BLOCK), the largest in each block
+    bounds_outdated: np.ndarray  # bool (slot,), whether bounds are to be set anew before they are used
+    breaks: np.ndarray  # int64 (slot,), breaks so far
 
 
 class Path(NamedTuple):
-    """What loads a parcel, (..., point)."""
+    """What loads the parcels, (streamline, point)."""
 
     log_stress: np.ndarray  # log(sigma_a / sigma_m)
     critical_ratio: np.ndarray  # least effective size over s_m that breaks
 
 
+class Passage(NamedTuple):
+    """Where parcels are crushed, int64 (parcel,): on which streamline, from which point to before which."""
+
+    slots: np.ndarray
+    lines: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+
+
 class Record(NamedTuple):
-    """What is kept of every point; empty arrays keep nothing."""
+    """What is kept of every point of a passage; empty arrays keep nothing."""
 
     sieves: np.ndarray  # float64 (sieve,), m
-    snapshots: np.ndarray  # float32 (..., point, cell), sizes, m
-    classes: np.ndarray  # int64 (..., point, sieve + 1), cells of each sieve class
+    counts: np.ndarray  # int64 (sieve + 1,), work space
+    snapshots: np.ndarray  # float32 (parcel, point, cell), sizes, m
+    classes: np.ndarray  # int64 (parcel, point, sieve + 1), cells of each sieve class
 
 
 class Work(NamedTuple):
@@ -90,8 +108,10 @@ class Work(NamedTuple):
     active: np.ndarray  # uint32 (block,)
     places: np.ndarray  # uint32 (candidate,)
     sizes: np.ndarray  # float64, m; then the fragment ratios
+    size_bits: np.ndarray  # int64, the bits of these
     totals: np.ndarray  # float64, size and those of both neighbours, m; then exponents
-    ratios: np.ndarray  # float64, effective size over s_m without neighbours; then work space of `_raise`
+    ratios: np.ndarray  # float64, effective size over s_m without neighbours; then powers of 2
+    ratio_bits: np.ndarray  # int64
     states: np.ndarray  # uint64, of the streams
     bounds: np.ndarray  # float32
     breaks: np.ndarray  # uint8
@@ -99,12 +119,47 @@ class Work(NamedTuple):
 
 
 class Edges(NamedTuple):
-    """Edges between material points, (edge, ...), with the probabilities of one exchange substep."""
+    """Edges between material points, (edge, ...), and in which order they swap in a time step."""
 
     pairs: np.ndarray  # int64 (edge, 2), points below and above
-    rise: np.ndarray  # float64, of a swap by segregation, 1/m
-    mixing: np.ndarray  # float64, of a swap by mixing
-    substeps: np.ndarray  # int64, in how many of the time step's substeps an edge takes part, evenly spread
+    rise: np.ndarray  # float64, probability of a swap by segregation in an exchange substep, 1/m
+    mixing: np.ndarray  # float64, by mixing
+    ceiling: np.ndarray  # float64, what holds segregation, m^-1/2; 0: nothing
+    turns: np.ndarray  # int64 (turn,), edges of one substep after the other
+
+
+def make_parcels(count: int, cells: int, scattered: bool) -> Parcels:
+    """Return parcels without cells."""
+    blocks = -(-cells // BLOCK)
+    return Parcels(
+        np.zeros((count, cells + 2), np.float32),
+        np.zeros((count, cells + 2), np.uint64),
+        np.empty((count, cells + 2 if scattered else 0), np.float32),
+        np.empty((count, cells + 2), np.float32),
+        np.empty((count, blocks * BLOCK + 2), np.float32),
+        np.empty((count, -(-blocks // BLOCK) * BLOCK), np.float32),
+        np.ones(count, bool),
+        np.zeros(count, np.int64),
+    )
+
+
+def make_work(cells: int) -> Work:
+    """Return work space for lines of this many cells; lists are written and read in whole vectors."""
+    most = cells + 2 * BLOCK
+    sizes, totals, ratios = np.ones((3, most))
+    lists = np.empty((2, most), np.uint32)
+    answers = np.empty((2, most), np.uint8)
+    bits = sizes.view(np.int64), ratios.view(np.int64)
+    return Work(
+        *lists, sizes, bits[0], totals, ratios, bits[1], np.empty(most, np.uint64), np.empty(most, np.float32), *answers
+    )
+
+
+def make_record(sieves=(), snapshots=(0, 0, 0), classes=(0, 0, 0)) -> Record:
+    """Return arrays of these shapes for what is to be kept."""
+    sieves = np.array(sieves, float)
+    counts = np.empty(sieves.size + 1, np.int64)
+    return Record(sieves, counts, np.empty(snapshots, np.float32), np.empty(classes, np.int64))
 
 
 # --- vectors ------------------------------------------------------------------------------------------------
@@ -204,9 +259,22 @@ def uniform(state):
     return (np.float64(np.int64(mix(state) >> _SHIFT_12)) + 0.5) * 2.0**-52
 
 
+@_inner
+def _scale(ore):
+    """Return 3 / w, by which effective size answers to strength; without size effect it is 1 / strength."""
+    return ore.slope if ore.slope > 0.0 else 1.0
+
+
+@_inner
+def _weakness(state, ore):
+    """Return zeta^(-w/3), P(zeta > x) = exp(-x^k), by the number after the one that a stream is at."""
+    power = (-math.log(uniform(mix(state)))) ** (-1.0 / (ore.scatter * _scale(ore)))
+    return np.float32(min(max(power, 1e-30), 1e30))
+
+
 @_compiled
-def start_parcels(bases, uniforms, streams):
-    """Fill uniforms (parcel, cell) and streams (parcel, cell + 2) of parcels from two 64-bit bases each, (parcel, 2).
+def start_parcels(bases, ore, uniforms, streams, weakness):
+    """Fill uniforms (parcel, cell), streams and weakness (parcel, cell + 2) from two 64-bit bases each, (parcel, 2).
 
     A stream starts at the mix of the first base and the cell's place. Of the uniforms there is one in each of as many
     equal strata, in random order (Fisher & Yates).
@@ -215,16 +283,19 @@ def start_parcels(bases, uniforms, streams):
     for k in range(bases.shape[0]):
         for p in range(1, cells + 1):
             streams[k, p] = mix(bases[k, 0] + np.uint64(p) * _GOLDEN)
-        row, state = uniforms[k], bases[k, 1]
+        if weakness.shape[1] > 0:
+            for p in range(1, cells + 1):
+                weakness[k, p] = _weakness(streams[k, p], ore)
+        state = bases[k, 1]
         for p in range(cells):
-            row[p] = p
+            uniforms[k, p] = p
         for p in range(cells - 1, 0, -1):
             state += _GOLDEN
             q = np.int64(uniform(state) * (p + 1))
-            row[p], row[q] = row[q], row[p]
+            uniforms[k, p], uniforms[k, q] = uniforms[k, q], uniforms[k, p]
         for p in range(cells):
             state += _GOLDEN
-            row[p] = (row[p] + uniform(state)) / cells
+            uniforms[k, p] = (uniforms[k, p] + uniform(state)) / cells
 
 
 # --- sieves -------------------------------------------------------------------------------------------------
@@ -259,7 +330,7 @@ def sieve_class(sieves, size):
     return low
 
 
-@_compiled
+@_inner
 def _count(sizes, places, found, sieves, step, counts):
     """Add `step` to the sieve class (sieve + 1) of each of the first `found` places."""
     for k in range(found):
@@ -267,14 +338,12 @@ def _count(sizes, places, found, sieves, step, counts):
 
 
 @_compiled
-def classify(sizes, slots, sieves, classes):
-    """Count the cells of each sieve class in the parcels of these slots into `classes` (slot, sieve + 1)."""
-    for k in range(slots.size):
-        row = sizes[slots[k]]
-        for m in range(sieves.size + 1):
-            classes[k, m] = 0
-        for p in range(1, row.size - 1):
-            classes[k, sieve_class(sieves, row[p])] += 1
+def classify(sizes, slot, sieves, counts):
+    """Count the cells of each sieve class in the parcel of a slot into `counts` (sieve + 1)."""
+    for m in range(counts.size):
+        counts[m] = 0
+    for p in range(1, sizes.shape[1] - 1):
+        counts[sieve_class(sieves, sizes[slot, p])] += 1
 
 
 # --- crushing -----------------------------------------------------------------------------------------------
@@ -318,25 +387,6 @@ def _join(count, values, powers):
         values[k] *= powers[k]
 
 
-@_compiled
-def _scale(ore):
-    """Return 3 / w, by which effective size answers to strength; without size effect it is 1 / strength."""
-    return ore.slope if ore.slope > 0.0 else 1.0
-
-
-@_compiled
-def _draw_weakness(streams, ore, weakness):
-    """Set the weakness zeta^(-w/3) of each cell, P(zeta > x) = exp(-x^k), by the mix of its stream's last number."""
-    for p in range(1, weakness.size - 1):
-        weakness[p] = _weakness(streams[p], ore)
-
-
-@_compiled
-def _weakness(state, ore):
-    power = (-math.log(uniform(mix(state)))) ** (-1.0 / (ore.scatter * _scale(ore)))
-    return np.float32(min(max(power, 1e-30), 1e30))
-
-
 @_inlined
 def _unshielded(size, bound_per_size, size_floor):
     """Return the bound of a cell whose neighbourhood is new; nothing below the floor ever breaks."""
@@ -345,23 +395,23 @@ def _unshielded(size, bound_per_size, size_floor):
     return _NEVER if size < size_floor else bound
 
 
-@_compiled
+@_inner
 def _bound_per_size(ore):
     return _MARGIN / ore.reference_size if ore.slope > 0.0 else 0.0
 
 
-@_compiled
+@_inner
 def _close(line):
     """Copy the ends of a periodic line to the places beyond them."""
     line[0], line[line.size - 1] = line[line.size - 2], line[1]
 
 
-@_compiled
-def set_bounds(parcel, ore):
+@_inner
+def _set_bounds(sizes, weakness, unshielded, bounds, block_bounds, ore):
     """Set the bounds of a line of cells whose neighbourhoods are all new."""
-    sizes, _, weakness, unshielded, bounds, block_bounds = parcel
     cells = sizes.size - 2
     bound_per_size, size_floor = _bound_per_size(ore), ore.size_floor
+    _close(sizes)
     unshielded[0] = unshielded[cells + 1] = _NEVER
     for p in range(1, cells + 1):
         unshielded[p] = _unshielded(np.float64(sizes[p]), bound_per_size, size_floor)
@@ -372,23 +422,6 @@ def set_bounds(parcel, ore):
         bounds[p] = unshielded[p] if p <= cells else _NEVER
     for block in range(block_bounds.size):
         block_bounds[block] = _largest(bounds, block * BLOCK + 1) if block * BLOCK < cells else _NEVER
-
-
-@_compiled
-def workspace(cells):
-    """Return the work space for lines of this many cells; lists are written and read in whole vectors."""
-    most = cells + 2 * BLOCK
-    return Work(
-        np.empty(most, np.uint32),
-        np.empty(most, np.uint32),
-        np.ones(most),
-        np.ones(most),
-        np.ones(most),
-        np.empty(most, np.uint64),
-        np.empty(most, np.float32),
-        np.empty(most, np.uint8),
-        np.empty(most, np.uint8),
-    )
 
 
 @_inlined
@@ -455,7 +488,7 @@ def _decide(count, sizes, totals, ratios, cushion, critical_ratio, bounds, break
     return doubts > 0
 
 
-@_compiled
+@_inner
 def _decide_by_logarithms(candidates, sizes, totals, weakness, places, ore, log_stress, bounds, breaks, unsure):
     """Decide the breaks that are unsure."""
     for k in range(candidates):
@@ -492,22 +525,15 @@ def _draw(streams, places, found, states, ratios):
         ratios[k] = uniform(states[k])
 
 
-@_compiled
-def _exponents(sizes, places, found, ore, powers, exponents, work):
-    """Fill the exponents 1 / gamma(s) of the parents' fragment ratios."""
-    for k in range(found):
-        powers[k], exponents[k] = ore.size_exponent, np.float64(sizes[places[k]]) / ore.parent_size
-    _split(found, exponents.view(np.int64), work.view(np.int64))
-    _exponentiate(found, exponents, powers, work.view(np.int64))
-    _join(found, exponents, work)
-    for k in range(found):
-        exponents[k] = min(max(ore.inverse_exponent / exponents[k], 1.0 / HELD[1]), 1.0 / HELD[0])
-
-
 @_inlined
-def _fill(exponents, count, inverse_exponent):
-    for k in range(count):
-        exponents[k] = inverse_exponent
+def _exponents(sizes, places, found, ore, exponents):
+    """Fill the exponents 1 / gamma(s) of the parents' fragment ratios, to the end of the last vector."""
+    for k in range(found + BLOCK):
+        exponents[k] = ore.inverse_exponent
+    if ore.size_exponent != 0.0:
+        for k in range(found):
+            power = (np.float64(sizes[places[k]]) / ore.parent_size) ** ore.size_exponent
+            exponents[k] = min(max(ore.inverse_exponent / power, 1.0 / HELD[1]), 1.0 / HELD[0])
 
 
 @_inlined
@@ -531,7 +557,7 @@ def _break(sizes, unshielded, places, found, ore, ratios):
     _close(sizes)
 
 
-@_compiled
+@_inner
 def _draw_strength(streams, weakness, unshielded, places, found, ore):
     """Draw the strength of each fragment."""
     for k in range(found):
@@ -577,280 +603,259 @@ def _renew_seams(bounds, block_bounds, active, actives, cells):
 
 
 @_compiled
-def crush(parcel, path, ore, work, record):
-    """Crush one line of cells at each point of a path; return its number of breaks.
+def crush(parcels, passage, path, ore, work, record):
+    """Crush parcels at every point of their passages.
 
     Every break of a point is decided on the sizes before it, and a cell breaks once at a point. A break draws one
-    number of the cell's own stream. One call for all points: handing over the tuples costs as much as a step.
+    number of its place's stream. One call for many parcels: a thread that waits for its turn between short calls would
+    lose what a second core gains (2 threads: 1.0 -> 1.7 times one).
     """
-    sizes, streams, weakness, unshielded, bounds, block_bounds = parcel
-    active, places, chosen, totals, ratios, states, tight, breaking, unsure = work
+    active, places, chosen, bits, totals, ratios, ratio_bits, states, tight, breaking, unsure = work
     log_stress, critical_ratio = path
-    sieves, snapshots, classes = record
-    bits, ratio_bits = chosen.view(np.int64), ratios.view(np.int64)
-    cushion = ore.cushion / _scale(ore)
+    sieves, counts, snapshots, classes = record
+    cells, cushion = parcels.sizes.shape[1] - 2, ore.cushion / _scale(ore)
     powers = ore.fragments == POWER_LAW and (ore.inverse_exponent != 1.0 or ore.size_exponent != 0.0)
-    counts = np.zeros(sieves.size + 1, np.int64)
-    if sieves.size:
-        for p in range(1, sizes.size - 1):
-            counts[sieve_class(sieves, sizes[p])] += 1
-    breaks = 0
-    for j in range(log_stress.size):
-        critical = critical_ratio[j]
-        if critical < np.inf:
-            needed = np.float32(min(critical, 3e38))  # float32 ends there, beyond every effective size
-            actives = _list_blocks(needed, block_bounds, active)
-            count = _list_candidates(needed, bounds, active, actives, places)
-            _gather(sizes, weakness, places, count, ore, chosen, totals, ratios)
-            if ore.strength == SIZE_EFFECT:
-                # in whole vectors; what is decided beyond the last candidate is not read
-                whole = (count + BLOCK - 1) // BLOCK * BLOCK
-                if _decide(whole, chosen, totals, ratios, cushion, critical, tight, breaking, unsure):
-                    _decide_by_logarithms(
-                        count, chosen, totals, weakness, places, ore, log_stress[j], tight, breaking, unsure
-                    )
-            found = _list_breaks(count, tight, breaking, bounds, places)
-            if sieves.size:
-                _count(sizes, places, found, sieves, -1, counts)
-            _draw(streams, places, found, states, chosen)
-            if powers:
-                if ore.size_exponent != 0.0:
-                    _exponents(sizes, places, found, ore, ratios, totals, states.view(np.float64))
-                else:
-                    _fill(totals, found + 7, ore.inverse_exponent)
-                whole = (found + 7) // 8 * 8
-                _split(whole, bits, ratio_bits)
-                _exponentiate(whole, chosen, totals, ratio_bits)
-                _join(whole, chosen, ratios)
-                _settle_powers(sizes, streams, places, found, chosen, totals)
-            _break(sizes, unshielded, places, found, ore, chosen)
-            if weakness.size:
-                _draw_strength(streams, weakness, unshielded, places, found, ore)
-            if sieves.size:
-                _count(sizes, places, found, sieves, 1, counts)
-            _renew(unshielded, bounds, places, found)
-            if found:
-                _renew_ends(unshielded, bounds, places[0], places[found - 1])
-            _renew_blocks(bounds, block_bounds, active, actives)
-            _renew_seams(bounds, block_bounds, active, actives, sizes.size - 2)
-            breaks += found
-        if snapshots.size:
-            for p in range(1, sizes.size - 1):
-                snapshots[j, p - 1] = sizes[p]
-        if classes.size:
-            for m in range(counts.size):
-                classes[j, m] = counts[m]
-    return breaks
+    for k in range(passage.slots.size):
+        slot, line = passage.slots[k], passage.lines[k]
+        sizes, streams, weakness = parcels.sizes[slot], parcels.streams[slot], parcels.weakness[slot]
+        unshielded, bounds, block_bounds = parcels.unshielded[slot], parcels.bounds[slot], parcels.block_bounds[slot]
+        if sieves.size:
+            classify(parcels.sizes, slot, sieves, counts)
+        for j in range(passage.first[k], passage.last[k]):
+            critical = critical_ratio[line, j]
+            if critical < np.inf:
+                if parcels.bounds_outdated[slot]:
+                    _set_bounds(sizes, weakness, unshielded, bounds, block_bounds, ore)
+                    parcels.bounds_outdated[slot] = False
+                needed = np.float32(min(critical, 3e38))  # float32 ends there, beyond every effective size
+                actives = _list_blocks(needed, block_bounds, active)
+                count = _list_candidates(needed, bounds, active, actives, places)
+                _gather(sizes, weakness, places, count, ore, chosen, totals, ratios)
+                if ore.strength == SIZE_EFFECT:
+                    # in whole vectors; what is decided beyond the last candidate is not read
+                    whole = (count + BLOCK - 1) // BLOCK * BLOCK
+                    if _decide(whole, chosen, totals, ratios, cushion, critical, tight, breaking, unsure):
+                        level = log_stress[line, j]
+                        _decide_by_logarithms(
+                            count, chosen, totals, weakness, places, ore, level, tight, breaking, unsure
+                        )
+                found = _list_breaks(count, tight, breaking, bounds, places)
+                if sieves.size:
+                    _count(sizes, places, found, sieves, -1, counts)
+                _draw(streams, places, found, states, chosen)
+                if powers:
+                    whole = (found + BLOCK - 1) // BLOCK * BLOCK
+                    _exponents(sizes, places, found, ore, totals)
+                    _split(whole, bits, ratio_bits)
+                    _exponentiate(whole, chosen, totals, ratio_bits)
+                    _join(whole, chosen, ratios)
+                    _settle_powers(sizes, streams, places, found, chosen, totals)
+                _break(sizes, unshielded, places, found, ore, chosen)
+                if weakness.size:
+                    _draw_strength(streams, weakness, unshielded, places, found, ore)
+                if sieves.size:
+                    _count(sizes, places, found, sieves, 1, counts)
+                _renew(unshielded, bounds, places, found)
+                if found:
+                    _renew_ends(unshielded, bounds, places[0], places[found - 1])
+                _renew_blocks(bounds, block_bounds, active, actives)
+                _renew_seams(bounds, block_bounds, active, actives, cells)
+                parcels.breaks[slot] += found
+            if snapshots.size:
+                for p in range(cells):
+                    snapshots[k, j, p] = sizes[p + 1]
+            if classes.size:
+                for m in range(counts.size):
+                    classes[k, j, m] = counts[m]
+
+
+# --- exchange -----------------------------------------------------------------------------------------------
 
 
 @_compiled
-def march(sizes, streams, lines, path, ore, record, breaks):
-    """Crush several parcels, each along its streamline, in one call: a thread that waits for its turn between short
-    calls would lose what a second core gains (2 threads: 1.0 -> 1.7 times one).
-
-    Parameters
-    ----------
-    sizes, streams : float32, uint64 (parcel, cell + 2)
-        The parcels on entry; on return as they leave.
-    lines : int64 (parcel,)
-        Streamline of each parcel.
-    path : Path
-        (streamline, point).
-    ore : Ore
-        Constants of its laws.
-    record : Record
-        Filled at every point, (parcel, point, ...).
-    breaks : int64 (parcel,)
-        Set to the number of breaks.
-    """
+def measure(sizes, slots, means):
+    """Fill the mean size of the parcel in each of these slots, m; eight sums are vectorised where one is not."""
     cells = sizes.shape[1] - 2
-    blocks = (cells + BLOCK - 1) // BLOCK
-    weakness = np.empty(cells + 2 if ore.scatter < np.inf else 0, np.float32)
-    unshielded, bounds = np.empty(cells + 2, np.float32), np.empty(blocks * BLOCK + 2, np.float32)
-    block_bounds = np.empty((blocks + BLOCK - 1) // BLOCK * BLOCK, np.float32)
-    work = workspace(cells)
-    no_snapshots, no_classes = np.empty((0, 0), np.float32), np.empty((0, 0), np.int64)
-    for k in range(lines.size):
-        parcel = Parcels(sizes[k], streams[k], weakness, unshielded, bounds, block_bounds)
-        _draw_weakness(parcel.streams, ore, weakness)
-        _close(parcel.sizes)
-        set_bounds(parcel, ore)
-        own = Path(path.log_stress[lines[k]], path.critical_ratio[lines[k]])
-        snapshots = record.snapshots[k] if record.snapshots.size else no_snapshots
-        classes = record.classes[k] if record.classes.size else no_classes
-        breaks[k] = crush(parcel, own, ore, work, Record(record.sieves, snapshots, classes))
+    for k in range(slots.size):
+        row = sizes[slots[k]]
+        a = b = c = d = e = f = g = h = 0.0
+        for n in range(cells // 8):
+            p = np.uint64(8 * n + 1)
+            a += np.float64(row[p])
+            b += np.float64(row[p + _1])
+            c += np.float64(row[p + np.uint64(2)])
+            d += np.float64(row[p + np.uint64(3)])
+            e += np.float64(row[p + np.uint64(4)])
+            f += np.float64(row[p + np.uint64(5)])
+            g += np.float64(row[p + np.uint64(6)])
+            h += np.float64(row[p + np.uint64(7)])
+        for p in range(cells // 8 * 8 + 1, cells + 1):
+            a += np.float64(row[p])
+        means[k] = (((a + b) + (c + d)) + ((e + f) + (g + h))) / cells
 
 
-# --- the lattice --------------------------------------------------------------------------------------------
+@_inlined
+def _fill_numbers(numbers, state):
+    """Fill random numbers of 64 bits, each for two cells."""
+    for k in range(numbers.size):
+        numbers[k] = mix(state + np.uint64(k + 1) * _GOLDEN)
 
 
-@_compiled
-def crush_lattice(parcels, bounds_outdated, breaks, slots, path, ore):
-    """Crush every parcel of the lattice once, each under the stress of the point it is at.
+@_inlined
+def _drive(rise, mixing, below, above, ceiling):
+    """Return what `_chance` takes beside the sizes, given the mean sizes below and above an edge."""
+    return rise, mixing, below, above, ceiling / math.sqrt(below), ceiling / math.sqrt(above)
 
-    Parameters
-    ----------
-    parcels : Parcels
-        (slot, ...).
-    bounds_outdated : bool (slot,)
-        Whether a parcel's bounds are to be set anew before they are used.
-    breaks : int64 (slot,)
-        Breaks of each parcel, added to.
-    slots : int64 (number of points,)
-        Slot of the parcel at each point, streamline by streamline.
-    path : Path
-        (number of points,).
-    ore : Ore
-        Constants of its laws.
+
+@_inlined
+def _chance(a, b, drive):
+    """Return the probability that cells of sizes a below and b above an edge swap."""
+    rise, mixing, below, above, held_below, held_above = drive
+    up, down = max(a - below, 0.0), max(above - b, 0.0)
+    return mixing + rise * (up / (1.0 + held_below * up) + down / (1.0 + held_above * down))
+
+
+@_inlined
+def _swap_densely(sizes, lower, upper, first, last, drive, halves, hits):
+    """Decide the cells of an edge in turn, without branches; return the number of swaps.
+
+    Chances are float32, as sizes are, of numbers of 31 bits: vectors hold twice as many.
     """
-    work = workspace(parcels.sizes.shape[1] - 2)
-    record = Record(np.empty(0), np.empty((0, 0), np.float32), np.empty((0, 0), np.int64))
-    for point in range(slots.size):
-        if path.critical_ratio[point] == np.inf:
-            continue
-        slot = slots[point]
-        parcel = Parcels(
-            parcels.sizes[slot],
-            parcels.streams[slot],
-            parcels.weakness[slot],
-            parcels.unshielded[slot],
-            parcels.bounds[slot],
-            parcels.block_bounds[slot],
-        )
-        if bounds_outdated[slot]:
-            _draw_weakness(parcel.streams, ore, parcel.weakness)
-            _close(parcel.sizes)
-            set_bounds(parcel, ore)
-            bounds_outdated[slot] = False
-        here = Path(path.log_stress[point : point + 1], path.critical_ratio[point : point + 1])
-        breaks[slot] += crush(parcel, here, ore, work, record)
-
-
-@_compiled
-def _largest_bits(sizes):
-    """Return the bits of the largest of a line of sizes; positive floats order like their bits."""
-    bits = sizes.view(np.int32)  # a maximum of integers is vectorised, one of floats is not
-    highest = np.int32(0)
-    for p in range(1, bits.size - 1):
-        highest = max(highest, bits[p])
-    return highest
-
-
-@_compiled
-def _total(sizes):
-    """Return the sum of a line of sizes; eight partial sums are vectorised where one is not (1.0 -> 0.2 ns a cell)."""
-    a = b = c = d = e = f = g = h = 0.0
-    cells = sizes.size - 2
-    whole = cells // 8
-    for k in range(whole):
-        p = 8 * k + 1
-        a += np.float64(sizes[p])
-        b += np.float64(sizes[p + 1])
-        c += np.float64(sizes[p + 2])
-        d += np.float64(sizes[p + 3])
-        e += np.float64(sizes[p + 4])
-        f += np.float64(sizes[p + 5])
-        g += np.float64(sizes[p + 6])
-        h += np.float64(sizes[p + 7])
-    for p in range(8 * whole + 1, cells + 1):
-        a += np.float64(sizes[p])
-    return ((a + b) + (c + d)) + ((e + f) + (g + h))
-
-
-@_compiled
-def measure(sizes, slots, means, largest):
-    """Fill the mean size at every point and the largest size of every slot, m."""
-    for point in range(slots.size):
-        slot = slots[point]
-        means[point] = _total(sizes[slot]) / (sizes.shape[1] - 2)
-        largest.view(np.int32)[slot] = _largest_bits(sizes[slot])
-
-
-@_compiled
-def _swap_densely(below, above, streams_below, streams_above, state, rise, mixing, mean_below, mean_above):
-    """Decide every cell of an edge in turn, without branches; return the number of swaps."""
-    swaps = 0
-    for p in range(1, below.size - 1):
-        a, b = below[p], above[p]
-        chance = mixing + rise * (max(a - mean_below, 0.0) + max(mean_above - b, 0.0))
-        number = mix(state + np.uint64(p) * _GOLDEN)
-        hit = np.float64(np.int64(number >> _SHIFT_12)) < chance * 2.0**52
-        below[p], above[p] = b if hit else a, a if hit else b
-        s, t = streams_below[p], streams_above[p]
-        streams_below[p], streams_above[p] = t if hit else s, s if hit else t
-        swaps += hit
+    rise, mixing, below, above, held_below, held_above = drive
+    per_size, chance_of_all = np.float32(rise * 2.0**31), np.float32(mixing * 2.0**31)
+    mean_below, mean_above, zero, one = np.float32(below), np.float32(above), np.float32(0.0), np.float32(1.0)
+    held, held_up, held_down = held_below > 0.0, np.float32(held_below), np.float32(held_above)
+    swaps = np.int32(0)
+    for k in range(last - first):
+        p = np.uint64(first + k)
+        a, b = sizes[lower, p], sizes[upper, p]
+        up, down = max(a - mean_below, zero), max(mean_above - b, zero)
+        if held:
+            up, down = up / (one + held_up * up), down / (one + held_down * down)
+        hit = np.float32(halves[k] & np.int32(0x7FFFFFFF)) < chance_of_all + per_size * (up + down)
+        sizes[lower, p], sizes[upper, p] = b if hit else a, a if hit else b
+        hits[k] = hit
+        swaps += np.int32(hit)
     return swaps
 
 
-@_compiled
+@_inlined
+def _follow(values, lower, upper, first, last, hits):
+    """Swap what belongs to the cells that have swapped."""
+    for k in range(last - first):
+        p = np.uint64(first + k)
+        a, b = values[lower, p], values[upper, p]
+        values[lower, p], values[upper, p] = b if hits[k] else a, a if hits[k] else b
+
+
+@_inner
 def _skipped(number, per_cell, cells):
     """Return how many cells a geometric skip passes over, from a uniform number and 1 / log(1 - P)."""
     skip = math.log(number) * per_cell
     return np.int64(skip) if skip < cells else np.int64(cells)
 
 
+@_inner
+def _swap_sparsely(sizes, weakness, lower, upper, first, last, state, drive, most):
+    """Swap cells of an edge, candidates drawn by geometric skipping with its largest probability and then thinned."""
+    number = uniform(state)
+    if number < 1.0 - (last - first) * most:  # then the first candidate lies past the last cell: no logarithm needed
+        return 0
+    per_cell, swaps = 1.0 / math.log1p(-most), 0
+    p = first + _skipped(number, per_cell, last)
+    while p < last:
+        a, b = sizes[lower, p], sizes[upper, p]
+        state += _GOLDEN
+        if uniform(state) * most < _chance(a, b, drive):
+            sizes[lower, p], sizes[upper, p] = b, a
+            if weakness.shape[1] > 0:
+                weakness[lower, p], weakness[upper, p] = weakness[upper, p], weakness[lower, p]
+            swaps += 1
+        state += _GOLDEN
+        p += 1 + _skipped(uniform(state), per_cell, last)
+    return swaps
+
+
 @_compiled
-def swap(parcels, bounds_outdated, largest, slots, edges, means, number, most_substeps, key):
-    """Pass once over the edges and swap cells of equal index across each; return the number of swaps.
+def swap(parcels, slots, edges, means, largest, key, first, last, numbers, halves, hits):
+    """Swap cells of equal index across the edges, from a first place to before a last; return the number of swaps.
 
     A cell of size a below and one of size b above an edge swap with probability
-    mixing + rise [(a - mean below)+ + (mean above - b)+]. Where swaps are rare, candidates are drawn by geometric
-    skipping with the largest probability of the edge and then thinned, so that the cost follows the swaps, not the
-    cells; where they are frequent, every cell is decided in turn.
+    mixing + rise [(a - mean below)+ + (mean above - b)+], each part held where percolation has a ceiling. Where swaps
+    are rare, the cost follows the swaps, not the cells. Cells of other indices never meet these, so threads may share
+    the places between them.
 
     Parameters
     ----------
-    parcels, bounds_outdated : (slot, ...)
-        As in `crush_lattice`; cells move with their streams.
-    largest : float32 (slot,)
-        Bound of each parcel's sizes, m; kept up to date.
+    parcels : Parcels
+        (slot, ...); sizes swap, each with its grain's strength, while random streams stay at their places.
     slots : int64 (number of points,)
         Slot of the parcel at each point.
     edges : Edges
-        Edges and their probabilities.
+        Edges, their probabilities, and their turns.
     means : float64 (number of points,)
         Mean size of each parcel, m, held during the time step.
-    number, most_substeps, key : int, int, uint64
-        Number of the substep, the number of all, and its key; edge e draws from a stream of its own.
+    largest, key : float, uint64
+        Bound of all sizes, m; key of the time step, of which every turn makes one of its own.
+    first, last : int
+        Places.
+    numbers, halves, hits : uint64 (cell / 2,), int32 (cell,), bool (cell,)
+        Work space for these places; `halves` are the bits of `numbers`.
     """
-    sizes, streams = parcels.sizes, parcels.streams
-    cells = sizes.shape[1] - 2
-    swaps = 0
-    for e in range(edges.pairs.shape[0]):
-        substeps, rise, mixing = edges.substeps[e], edges.rise[e], edges.mixing[e]
-        if (number + 1) * substeps // most_substeps == number * substeps // most_substeps:
-            continue
+    sizes, weakness, outdated = parcels.sizes, parcels.weakness, parcels.bounds_outdated
+    total = 0
+    for turn in range(edges.turns.size):
+        e = edges.turns[turn]
         lower, upper = slots[edges.pairs[e, 0]], slots[edges.pairs[e, 1]]
-        mean_below, mean_above = means[edges.pairs[e, 0]], means[edges.pairs[e, 1]]
-        most = mixing + rise * (max(largest[lower] - mean_below, 0.0) + mean_above)
+        below, above = means[edges.pairs[e, 0]], means[edges.pairs[e, 1]]
+        drive = _drive(edges.rise[e], edges.mixing[e], below, above, edges.ceiling[e])
+        most = _chance(largest, 0.0, drive)
         if most <= 0.0:
             continue
-        state = mix(key + np.uint64(e + 1) * _GOLDEN)
+        # each share of the places has a stream of its own
+        state = mix(mix(key + np.uint64(turn + 1) * _GOLDEN) + np.uint64(first) * _GOLDEN)
         if most > DENSE:
-            swaps += _swap_densely(
-                sizes[lower], sizes[upper], streams[lower], streams[upper], state, rise, mixing, mean_below, mean_above
-            )
-            bounds_outdated[lower] = bounds_outdated[upper] = True
-            largest[lower] = largest[upper] = max(largest[lower], largest[upper])
-            continue
-        first = uniform(state)
-        if first < 1.0 - cells * most:  # then the first candidate lies past the last cell: no logarithm needed
-            continue
-        per_cell = 1.0 / math.log1p(-most)
-        p = 1 + _skipped(first, per_cell, cells)
-        while p <= cells:
-            below, above = sizes[lower, p], sizes[upper, p]
-            chance = mixing + rise * (max(below - mean_below, 0.0) + max(mean_above - above, 0.0))
-            state += _GOLDEN
-            if uniform(state) * most < chance:
-                sizes[lower, p], sizes[upper, p] = above, below
-                streams[lower, p], streams[upper, p] = streams[upper, p], streams[lower, p]
-                largest[lower], largest[upper] = max(largest[lower], above), max(largest[upper], below)
-                bounds_outdated[lower] = bounds_outdated[upper] = True
-                swaps += 1
-            state += _GOLDEN
-            p += 1 + _skipped(uniform(state), per_cell, cells)
-    return swaps
+            _fill_numbers(numbers, state)
+            swaps = np.int64(_swap_densely(sizes, lower, upper, first, last, drive, halves, hits))
+            if weakness.shape[1] > 0:
+                _follow(weakness, lower, upper, first, last, hits)
+        else:
+            swaps = np.int64(_swap_sparsely(sizes, weakness, lower, upper, first, last, state, drive, most))
+        if swaps > 0:
+            outdated[lower] = outdated[upper] = True
+            total += swaps
+    return total
+
+
+@_compiled
+def swap_mean_field(fractions, sizes, edges, means, swaps):
+    """Swap as the lattice does in the limit of many cells.
+
+    Parameters
+    ----------
+    fractions : float64 (number of points, class)
+        Part of the cells at each point in each size class.
+    sizes : float64 (class,)
+        Mean sizes, m.
+    edges, means : Edges, float64 (number of points,)
+        As in `swap`.
+    swaps : float64 (edge,)
+        Expected swaps of a cell index across each edge, added to.
+    """
+    for turn in range(edges.turns.size):
+        e = edges.turns[turn]
+        lower, upper, mixing = edges.pairs[e, 0], edges.pairs[e, 1], edges.mixing[e]
+        drive = _drive(edges.rise[e], 0.0, means[lower], means[upper], edges.ceiling[e])
+        rising = sinking = 0.0
+        for c in range(sizes.size):
+            rising += fractions[lower, c] * _chance(sizes[c], np.inf, drive)
+            sinking += fractions[upper, c] * _chance(0.0, sizes[c], drive)
+        for c in range(sizes.size):
+            up = fractions[lower, c] * (mixing + _chance(sizes[c], np.inf, drive) + sinking)
+            down = fractions[upper, c] * (mixing + rising + _chance(0.0, sizes[c], drive))
+            fractions[lower, c] -= up - down
+            fractions[upper, c] += up - down
+        swaps[e] += mixing + rising + sinking
 
 
 # --- the closed form ----------------------------------------------------------------------------------------

@@ -1,19 +1,28 @@
-"""With exchange: the whole lattice in motion. Each step all parcels shift by one point, are crushed, and swap cells."""
+"""With exchange: the lattice in motion. Each time step all parcels shift by one point, are crushed, and swap cells.
+
+Where only the product is wanted, the lattice begins a little above the first point at which anything can break. Above
+it, among unbroken feed, the mean field of the same swaps is exact in the limit of many cells and has no noise.
+"""
 
 import math
+import os
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from hpgr.bed.loaded import LoadedBed
 from hpgr.grains import kernels, march
-from hpgr.grains.kernels import Edges, Parcels, Record
+from hpgr.grains.kernels import Edges, Passage
 from hpgr.grains.march import Cells
 from hpgr.scene import Scene
 
 LARGEST_SUM = 0.5  # of the swap probabilities of a cell in one substep; above it swaps overshoot their equilibrium
 MOST_SUBSTEPS = 1000  # per time step; a scene that needs more is refused
 _SECONDS_PER_EDGE = 1e-8  # of one substep of an edge without swaps
+_SHARE = 512  # places of a thread's share of the swaps; never fewer threads nor more change a bit
+_MARGIN = 8  # points between the first that breaks anything and the lattice's first
+_CLASSES = 24  # of equal mass that the mean field is made of
 
 
 class SwapRates(NamedTuple):
@@ -27,11 +36,14 @@ class SwapRates(NamedTuple):
         (edge,) probability of segregation per m of size difference, 1/m.
     mixing : ndarray
         (edge,) probability of mixing per squared mean size, 1/m2.
+    ceiling : ndarray
+        (edge,) what holds segregation, see `hpgr.laws.exchange.Exchange.ceiling`; 0 where nothing does.
     """
 
     pairs: np.ndarray
     rise: np.ndarray
     mixing: np.ndarray
+    ceiling: np.ndarray
 
 
 class Exchanged(NamedTuple):
@@ -67,11 +79,13 @@ def swap_rates(scene: Scene, bed: LoadedBed) -> SwapRates:
     tube = rolls.gap / (2 * scene.resolution.streamlines)
     # m / rho_b: what a tube lets through in a time step, at the local density
     parcel = tube * rolls.speed * rolls.diameter / 2 * time_step * solid_fraction[:, -1].mean()
-    sheared = cells.length * np.sqrt(3) * between(bed.kinematics.shear_rate) * time_step * between(solid_fraction)
+    shear_rate = np.sqrt(3) * between(bed.kinematics.shear_rate)
+    sheared = cells.length * shear_rate * time_step * between(solid_fraction)
     return SwapRates(
         pairs=cells.pairs,
-        rise=exchange.percolation(sheared, cells.normal[:, 1], parcel),
+        rise=exchange.rising(sheared, cells.normal[:, 1], parcel),
         mixing=exchange.diffusion(sheared, cells.distance, parcel),
+        ceiling=exchange.ceiling(shear_rate),
     )
 
 
@@ -111,6 +125,26 @@ def refuse_substeps(scene: Scene, rates: SwapRates, substeps: int) -> None:
         )
 
 
+def edges_of(scene: Scene, rates: SwapRates, means: np.ndarray) -> tuple[Edges, int]:
+    """Return the edges with the probabilities of one substep of a time step, given mean sizes, m, and the substeps."""
+    lower, upper = rates.pairs.T
+    mixing = rates.mixing * ((means[lower] + means[upper]) / 2) ** 2
+    substeps = substeps_needed(rates, mixing, means, scene.feed.largest_grain)
+    most = int(substeps.max(initial=1))
+    refuse_substeps(scene, rates, most)
+    numbers = np.arange(most + 1)[:, None] * substeps // most  # turns had so far; they are evenly spread
+    turns = np.nonzero(np.diff(numbers, axis=0))[1]
+    return Edges(rates.pairs, rates.rise / substeps, mixing / substeps, rates.ceiling, turns), most
+
+
+def within(rates: SwapRates, points: int, first: int, last: int) -> SwapRates:
+    """Return the rates of the edges between points `first` to before `last` of each streamline, numbered anew."""
+    line, point = np.divmod(rates.pairs, points)
+    inside = np.all((point >= first) & (point < last), axis=1)
+    pairs = line * (last - first) + point - first
+    return SwapRates(pairs[inside], *(part[inside] for part in rates[1:]))
+
+
 class Lattice:
     """All parcels between the rolls, in slots that stay put while the parcels shift from point to point.
 
@@ -127,6 +161,10 @@ class Lattice:
     steady : dict
         Time step -> number of the steady snapshot taken then. The parcel that is at the exit then has the key of the
         same snapshot without exchange, so that both share their random numbers.
+    each : callable
+        A map over parts of the work.
+    entering : list of callable, optional
+        Quantiles of what enters each streamline; the feed's if not given.
 
     Attributes
     ----------
@@ -134,32 +172,31 @@ class Lattice:
         (streamline, point) slot of the parcel that is there now.
     parcels : Parcels
         (slot, ...) their cells.
-    breaks : ndarray
-        (slot,) breaks of each parcel's cells since it entered.
     swaps, most_substeps : int
         Swaps so far, and the most substeps a time step has needed.
     """
 
     def __init__(
-        self, scene: Scene, log_stress: np.ndarray, rates: SwapRates, seed: int, replicate: int, steady: dict[int, int]
+        self,
+        scene: Scene,
+        log_stress: np.ndarray,
+        rates: SwapRates,
+        seed: int,
+        replicate: int,
+        steady: dict[int, int],
+        each: Callable = map,
+        entering: list[Callable] | None = None,
     ):
-        self._scene, self._rates, self._steady = scene, rates, steady
+        self._scene, self._rates, self._steady, self._each = scene, rates, steady, each
         self._seed, self._replicate = seed, replicate
         self._path, self._ore = march.path(scene, log_stress), march.ore(scene)
-        count, cells = log_stress.size, scene.resolution.cells
-        blocks = -(-cells // kernels.BLOCK)
-        self.parcels = Parcels(
-            np.zeros((count, cells + 2), np.float32),
-            np.zeros((count, cells + 2), np.uint64),
-            np.empty((count, 0 if math.isinf(scene.strength.scatter) else cells + 2), np.float32),
-            np.empty((count, cells + 2), np.float32),
-            np.empty((count, blocks * kernels.BLOCK + 2), np.float32),
-            np.empty((count, -(-blocks // kernels.BLOCK) * kernels.BLOCK), np.float32),
-        )
-        self._bounds_outdated, self._largest = np.ones(count, bool), np.empty(count, np.float32)
-        self.breaks = np.zeros(count, np.int64)
-        self._home = np.arange(count).reshape(log_stress.shape)
+        cells, scattered = scene.resolution.cells, math.isfinite(scene.strength.scatter)
+        self.parcels = kernels.make_parcels(log_stress.size, cells, scattered)
+        self._works = [kernels.make_work(cells) for _ in range(os.cpu_count() or 1)]
+        self._nothing = kernels.make_record()
+        self._home = np.arange(log_stress.size).reshape(log_stress.shape)
         self.slots = self._home
+        self._entering = entering or [scene.feed.quantile] * log_stress.shape[0]
         self.swaps, self.most_substeps = 0, 0
         source = np.random.SeedSequence(seed, spawn_key=(replicate,))
         self._swap_key = int(source.generate_state(1, np.uint64)[0])
@@ -167,13 +204,10 @@ class Lattice:
     def advance(self, step: int) -> None:
         """Take time step `step`: at 0 fill the machine, later shift all parcels and let feed in; crush; swap."""
         self.slots = np.roll(self._home, step, axis=1)
-        entering = self.slots[:, :1] if step else self.slots
-        self._let_in(step, entering)
-        self.breaks[entering], self._bounds_outdated[entering] = 0, True
-        everywhere = kernels.Path(*(part.ravel() for part in self._path))
-        kernels.crush_lattice(
-            self.parcels, self._bounds_outdated, self.breaks, self.slots.ravel(), everywhere, self._ore
-        )
+        self._let_in(step)
+        lines, points = np.divmod(np.arange(self.slots.size), self.slots.shape[1])
+        breaking = np.isfinite(self._path.critical_ratio.ravel())
+        self._crush(self.slots.ravel()[breaking], lines[breaking], points[breaking], points[breaking] + 1)
         self._swap(step)
 
     def sizes(self) -> np.ndarray:
@@ -182,26 +216,31 @@ class Lattice:
 
     def classes(self, sieves: np.ndarray) -> np.ndarray:
         """Return the cells of each sieve class, (streamline, point, sieve + 1)."""
-        counts = np.empty((self.slots.size, sieves.size + 1), np.int64)
-        kernels.classify(self.parcels.sizes, self.slots.ravel(), sieves, counts)
-        return counts.reshape(*self.slots.shape, -1)
+        counts = np.empty((*self.slots.shape, sieves.size + 1), np.int64)
+        for place, slot in np.ndenumerate(self.slots):
+            kernels.classify(self.parcels.sizes, slot, sieves, counts[place])
+        return counts
 
-    def _let_in(self, step: int, entering: np.ndarray) -> None:
+    def _crush(self, slots: np.ndarray, lines: np.ndarray, first: np.ndarray, last: np.ndarray) -> None:
+        """Crush parcels at their points from `first` to before `last`, shared between the cores."""
+        parts = np.array_split(np.arange(slots.size), len(self._works))
+
+        def crush(work, part):
+            passage = Passage(*(np.ascontiguousarray(each[part]) for each in (slots, lines, first, last)))
+            kernels.crush(self.parcels, passage, self._path, self._ore, work, self._nothing)
+
+        list(self._each(crush, self._works, parts))
+
+    def _let_in(self, step: int) -> None:
         """Put new parcels in the first points; at the first fill as the bed would have brought them there."""
-        for line, slots in enumerate(entering):
+        for line, slots in enumerate(self.slots[:, :1] if step else self.slots):
             keys = [self._key(line, step - point) for point in range(slots.size)]
-            self.parcels.sizes[slots], self.parcels.streams[slots] = march.first_cells(self._scene, self._seed, keys)
+            fresh = march.first_cells(self._scene, self._seed, keys, self._entering[line])
+            for mine, new in zip(self.parcels, fresh, strict=True):
+                mine[slots] = new
         if step == 0 and self._scene.exchange.start == "crushed":
-            for point in range(1, entering.shape[1]):
-                self._crush_before(entering[:, point], point)
-
-    def _crush_before(self, slots: np.ndarray, point: int) -> None:
-        """Crush the parcels of these slots, one per streamline, at all points before `point`."""
-        sizes, streams = self.parcels.sizes[slots], self.parcels.streams[slots]
-        before = kernels.Path(*(np.ascontiguousarray(part[:, :point]) for part in self._path))
-        nothing = Record(np.empty(0), np.empty((0, 0, 0), np.float32), np.empty((0, 0, 0), np.int64))
-        kernels.march(sizes, streams, np.arange(slots.size), before, self._ore, nothing, np.empty(slots.size, np.int64))
-        self.parcels.sizes[slots], self.parcels.streams[slots] = sizes, streams
+            lines, points = np.divmod(np.arange(self.slots.size), self.slots.shape[1])
+            self._crush(self.slots.ravel(), lines, 0 * points, points)
 
     def _key(self, line: int, entered: int) -> tuple[int, ...]:
         """Return the random key of the parcel that entered a streamline at a step, which may lie before the first."""
@@ -214,52 +253,130 @@ class Lattice:
 
     def _swap(self, step: int) -> None:
         """Swap cells across all edges, in as many substeps as keep the probabilities of a cell at 1/2."""
-        slots, rates = self.slots.ravel(), self._rates
+        slots, cells = self.slots.ravel(), self._scene.resolution.cells
         means = np.empty(slots.size)
-        kernels.measure(self.parcels.sizes, slots, means, self._largest)
-        lower, upper = rates.pairs.T
-        mixing = rates.mixing * ((means[lower] + means[upper]) / 2) ** 2
-        substeps = substeps_needed(rates, mixing, means, self._scene.feed.largest_grain)
-        most = int(substeps.max())
-        refuse_substeps(self._scene, rates, most)
+        kernels.measure(self.parcels.sizes, slots, means)
+        edges, most = edges_of(self._scene, self._rates, means)
         self.most_substeps = max(self.most_substeps, most)
-        edges = Edges(rates.pairs, rates.rise / substeps, mixing / substeps, substeps)
-        for number in range(most):
-            counter = (step << 20) + number + 1  # unique: the substeps of a step are far fewer than 2^20
-            key = np.uint64(kernels.mix(np.uint64((self._swap_key + counter * 0xD1342543DE82EF95) % 2**64)))
-            self.swaps += kernels.swap(
-                self.parcels, self._bounds_outdated, self._largest, slots, edges, means, number, most, key
+        key = np.uint64(kernels.mix(np.uint64((self._swap_key + (step + 1) * 0xD1342543DE82EF95) % 2**64)))
+        largest = self._scene.feed.largest_grain
+
+        def swap(first):
+            last, numbers, hits = (
+                min(first + _SHARE, cells + 1),
+                np.empty(_SHARE // 2, np.uint64),
+                np.empty(_SHARE, bool),
             )
+            work = numbers, numbers.view(np.int32), hits
+            return kernels.swap(self.parcels, slots, edges, means, largest, key, first, last, *work)
+
+        self.swaps += sum(self._each(swap, range(1, cells + 1, _SHARE)))
 
 
-def run(scene: Scene, log_stress: np.ndarray, bed: LoadedBed, seed: int, replicate: int) -> tuple[Cells, Exchanged]:
-    """Run the lattice through one residence time to the steady snapshots, and the start-up's if wished."""
+class Above(NamedTuple):
+    """What the steady mean field of unbroken feed gives to a lattice that begins at a point of it.
+
+    Attributes
+    ----------
+    entering : ndarray
+        (streamline, class) part of each class of the feed, classes of equal mass, in what enters the lattice.
+    swaps : float
+        Expected swaps of a cell index in a time step above the lattice.
+    substeps : int
+        Most substeps a time step has needed.
+    """
+
+    entering: np.ndarray
+    swaps: float
+    substeps: int
+
+
+def settle(scene: Scene, rates: SwapRates, shape: tuple[int, int], first: int) -> Above:
+    """Return what enters a lattice at point `first` of a bed (streamline, point) where nothing breaks."""
+    sizes = scene.feed.quantile((np.arange(8 * _CLASSES) + 0.5) / (8 * _CLASSES)).reshape(_CLASSES, 8).mean(axis=1)
+    fractions, most = np.full((*shape, _CLASSES), 1 / _CLASSES), 1
+    flat, swaps = fractions.reshape(-1, _CLASSES), np.zeros(len(rates.pairs))
+
+    def shift():
+        fractions[:, 1:], fractions[:, 0] = fractions[:, :-1].copy(), 1 / _CLASSES
+        means = flat @ sizes
+        return *edges_of(scene, rates, means), means
+
+    for _ in range(shape[1]):  # what is at the last point by then has seen the steady field of all others
+        edges, substeps, means = shift()
+        kernels.swap_mean_field(flat, sizes, edges, means, swaps)
+        most = max(most, substeps)
+    # The lattice swaps within itself, and not with what is above: its first parcels have done that when they enter.
+    # Or large grains, which rise, would be carried in and never out
+    edges, _, means = shift()
+    outside = (rates.pairs % shape[1] < first).sum(axis=1)[edges.turns]  # points of an edge above the lattice
+    swaps[:] = 0
+    kernels.swap_mean_field(flat, sizes, edges._replace(turns=edges.turns[outside == 1]), means, swaps)
+    entering = fractions[:, first].copy()
+    kernels.swap_mean_field(flat, sizes, edges._replace(turns=edges.turns[outside == 2]), means, swaps)
+    return Above(entering, swaps.sum(), most)
+
+
+def first_break(scene: Scene, log_stress: np.ndarray) -> int:
+    """Return the first point at which anything can break on any streamline; the number of points if none does."""
+    ratio = march.path(scene, log_stress).critical_ratio.min(axis=0)
+    if math.isinf(scene.strength.scatter) and math.isfinite(scene.strength.weibull_modulus):
+        breaking = ratio <= scene.feed.largest_grain / scene.strength.reference_size * (1 + 1e-6)
+    else:
+        breaking = np.isfinite(ratio)
+    return int(np.argmax(breaking)) if breaking.any() else ratio.size
+
+
+def run(
+    scene: Scene, log_stress: np.ndarray, bed: LoadedBed, seed: int, replicate: int, reduced: bool
+) -> tuple[Cells, Exchanged]:
+    """Run the lattice through one residence time to the steady snapshots, and the start-up's if wished.
+
+    A reduced one begins above the first break, with cells drawn from the mean field of what is above it.
+    """
     grid, wishes = scene.resolution, scene.exchange
-    last = grid.points - 1  # the step at which the first parcel that entered is at the exit
+    rates, entering, swaps, substeps = swap_rates(scene, bed), None, 0.0, 1
+    unbroken = first_break(scene, log_stress)
+    first = max(min(unbroken, grid.points - 1) - _MARGIN, 0) if reduced else 0
+    if first > 0:
+        above = settle(scene, within(rates, grid.points, 0, unbroken), (grid.streamlines, unbroken), first)
+        entering = [_quantile_of(scene, shares) for shares in above.entering]
+        swaps, substeps = above.swaps, above.substeps
+        rates = within(rates, grid.points, first, grid.points)
+    last = grid.points - 1 - first  # the step at which the first parcel that entered is at the exit
     steady = [last + k * wishes.interval for k in range(grid.snapshots)]
     steps = [*(range(0, last, wishes.interval) if wishes.record_startup else ()), *steady]
-    rates = swap_rates(scene, bed)
-    lattice = Lattice(scene, log_stress, rates, seed, replicate, {step: k for k, step in enumerate(steady)})
-    sieves = march.cell_sieves(scene)
+    sieves, mine = march.cell_sieves(scene), np.ascontiguousarray(log_stress[:, first:])
     sizes, classes, product, breaks = [], [], [], np.zeros(log_stress.shape[0], np.int64)
-    for step in range(steps[-1] + 1):
-        lattice.advance(step)
-        if step not in steps:
-            continue
-        if grid.record == "cells":
-            sizes.append(lattice.sizes())
-        if grid.record == "distributions":
-            classes.append(lattice.classes(sieves))
-        if step >= last:
-            at_exit = lattice.slots[:, -1]
-            product.append(lattice.parcels.sizes[at_exit, 1:-1])
-            breaks += lattice.breaks[at_exit]
-    residences = (steps[-1] + 1) / grid.points
+    with march.cores(mine.size * grid.cells) as each:
+        numbers = {step: k for k, step in enumerate(steady)}
+        lattice = Lattice(scene, mine, rates, seed, replicate, numbers, each, entering)
+        for step in range(steps[-1] + 1):
+            before = lattice.swaps
+            lattice.advance(step)
+            if step not in steps:
+                continue
+            if grid.record == "cells":
+                sizes.append(lattice.sizes())
+            if grid.record == "distributions":
+                classes.append(lattice.classes(sieves))
+            if step >= last:
+                at_exit = lattice.slots[:, -1]
+                product.append(lattice.parcels.sizes[at_exit, 1:-1])
+                breaks += lattice.parcels.breaks[at_exit]
+    # as of the whole lattice, which goes on for `first` more steps; a start-up of feed swaps more often
+    swaps += (lattice.swaps + first * (lattice.swaps - before)) / grid.cells / (steps[-1] + 1 + first)
     exchanged = Exchanged(
         elapsed_time=np.array(steps) * bed.kinematics.time_step,
         steady=np.array(steps) >= last,
-        substeps=lattice.most_substeps,
-        swaps_per_cell=2 * lattice.swaps / (log_stress.size * grid.cells * residences),
+        substeps=max(lattice.most_substeps, substeps),
+        swaps_per_cell=2 * swaps / grid.streamlines,
     )
     cells = Cells(np.stack(product), breaks, np.stack(sizes) if sizes else None, np.stack(classes) if classes else None)
     return cells, exchanged
+
+
+def _quantile_of(scene: Scene, shares: np.ndarray) -> Callable:
+    """Return the quantile function of a mixture of the feed's classes of equal mass."""
+    passing, feed = np.append(0.0, np.cumsum(shares)), np.linspace(0, 1, shares.size + 1)
+    return lambda fraction: scene.feed.quantile(np.interp(fraction, passing / passing[-1], feed))

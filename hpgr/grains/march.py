@@ -2,17 +2,19 @@
 
 import os
 import threading
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
 
 from hpgr.grains import kernels
-from hpgr.grains.kernels import Ore, Path, Record
+from hpgr.grains.kernels import Ore, Parcels, Passage, Path
 from hpgr.laws.roll_width import Slices
 from hpgr.scene import Scene
 
-_LARGE = 200_000  # cells of all parcels from which they are marched one by one, on all cores; fewer go at once
+_LARGE = 200_000  # cells of all parcels from which they are crushed on all cores
 
 
 class Cells(NamedTuple):
@@ -51,21 +53,32 @@ def cell_sieves(scene: Scene) -> np.ndarray:
     return np.array(scene.resolution.sieves, np.float32).astype(float)
 
 
-def first_cells(scene: Scene, seed: int, keys: list[tuple[int, ...]]) -> tuple[np.ndarray, np.ndarray]:
-    """Return sizes (float32, m) and random streams (uint64) of the cells of parcels of feed, (parcel, cell + 2).
+def first_cells(scene: Scene, seed: int, keys: list[tuple[int, ...]], quantile: Callable | None = None) -> Parcels:
+    """Return parcels of feed, a slot for each key.
 
-    A parcel's key (replicate, streamline, front) and `seed` decide every bit of both. Sizes are the feed's quantiles
-    at stratified uniforms, in random cell order: one uniform in each of as many equal strata represents the feed
-    with a lower variance than plain sampling.
+    A parcel's key (replicate, streamline, front) and `seed` decide every bit of it. Sizes are the quantiles of the
+    feed, or those given, at stratified uniforms in random cell order: one uniform in each of as many equal strata
+    represents the feed with a lower variance than plain sampling.
     """
     sources = [np.random.SeedSequence(seed, spawn_key=key) for key in keys]
     bases = np.array([source.generate_state(2, np.uint64) for source in sources])
-    cells = scene.resolution.cells
-    uniforms, streams = np.empty((len(keys), cells)), np.zeros((len(keys), cells + 2), np.uint64)
-    kernels.start_parcels(bases, uniforms, streams)
-    sizes = np.zeros((len(keys), cells + 2), np.float32)
-    sizes[:, 1:-1] = np.maximum(scene.feed.quantile(uniforms).astype(np.float32), np.float32(kernels.SMALLEST))
-    return sizes, streams
+    uniforms = np.empty((len(keys), scene.resolution.cells))
+    parcels = kernels.make_parcels(*uniforms.shape, scattered=np.isfinite(scene.strength.scatter))
+    kernels.start_parcels(bases, ore(scene), uniforms, parcels.streams, parcels.weakness)
+    sizes = (quantile or scene.feed.quantile)(uniforms).astype(np.float32)
+    parcels.sizes[:, 1:-1] = np.maximum(sizes, np.float32(kernels.SMALLEST))
+    return parcels
+
+
+@contextmanager
+def cores(cells: int) -> Iterator[Callable]:
+    """Give a map over parts of the work: on all cores where there are many cells, and nobody else has the cores."""
+    # only for a caller of hpgr.simulate: the worker threads of a study have the cores already
+    if cells >= _LARGE and threading.current_thread() is threading.main_thread():
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            yield pool.map
+    else:
+        yield map
 
 
 def march(scene: Scene, log_stress: np.ndarray, slices: Slices, seed: int, replicate: int) -> Cells:
@@ -82,48 +95,36 @@ def march(scene: Scene, log_stress: np.ndarray, slices: Slices, seed: int, repli
     seed, replicate : int
         Keys of the randomness.
     """
-    grid, tubes = scene.resolution, log_stress.shape[0]
+    grid, tubes, points = scene.resolution, *log_stress.shape
     # every slice marches the same parcels under its own pressure, so that slices differ by that alone
-    loads = path(scene, (log_stress + np.log(slices.pressure)[:, None, None]).reshape(-1, log_stress.shape[1]))
-    shape = (grid.snapshots, *loads.log_stress.shape)
-    columns = list(np.ndindex(*shape[:2]))
+    loads = path(scene, (log_stress + np.log(slices.pressure)[:, None, None]).reshape(-1, points))
+    columns = list(np.ndindex(grid.snapshots, loads.log_stress.shape[0]))
     keys = [(replicate, line % tubes, snapshot) for snapshot, line in columns]
     lines, breaks = np.array([line for _, line in columns]), np.empty(len(columns), np.int64)
     product = np.empty((len(columns), grid.cells), np.float32)
-    record = _record(scene, (len(columns), shape[2]))
+    kept = {
+        "cells": {"snapshots": (len(columns), points, grid.cells)},
+        "distributions": {"sieves": cell_sieves(scene), "classes": (len(columns), points, len(grid.sieves) + 1)},
+    }
+    record = kernels.make_record(**kept.get(grid.record, {}))
 
     def crush(part: slice) -> None:
-        sizes, streams = first_cells(scene, seed, keys[part])
-        kept = Record(record.sieves, record.snapshots[part], record.classes[part])
-        kernels.march(sizes, streams, lines[part], loads, ore(scene), kept, breaks[part])
-        product[part] = sizes[:, 1:-1]
+        parcels = first_cells(scene, seed, keys[part])
+        slots = np.arange(parcels.breaks.size)
+        passage = Passage(slots, lines[part], 0 * slots, 0 * slots + points)
+        own = record._replace(
+            counts=record.counts.copy(), snapshots=record.snapshots[part], classes=record.classes[part]
+        )
+        kernels.crush(parcels, passage, loads, ore(scene), kernels.make_work(grid.cells), own)
+        product[part], breaks[part] = parcels.sizes[:, 1:-1], parcels.breaks
 
-    _for_each(crush, len(columns), product.size)
+    large = product.size >= _LARGE
+    with cores(product.size) as each:
+        list(each(crush, [slice(k, k + 1) for k in range(len(columns))] if large else [slice(None)]))
+    shape = (grid.snapshots, -1, points)
     return Cells(
-        product.reshape(*shape[:2], -1),
-        breaks.reshape(shape[:2]).sum(axis=0),
-        record.snapshots.reshape(*shape, -1) if record.snapshots.size else None,
-        record.classes.reshape(*shape, -1) if record.classes.size else None,
+        product.reshape(grid.snapshots, -1, grid.cells),
+        breaks.reshape(grid.snapshots, -1).sum(axis=0),
+        record.snapshots.reshape(*shape, grid.cells) if record.snapshots.size else None,
+        record.classes.reshape(*shape, record.classes.shape[-1]) if record.classes.size else None,
     )
-
-
-def _record(scene: Scene, shape: tuple[int, int]) -> Record:
-    """Return arrays (parcel, point, ...) for what the scene records of every point, empty for what it does not."""
-    wanted, sieves = scene.resolution.record, np.empty(0)
-    snapshots = np.empty((*shape, scene.resolution.cells) if wanted == "cells" else (0, 0, 0), np.float32)
-    if wanted == "distributions":
-        sieves = cell_sieves(scene)
-    return Record(sieves, snapshots, np.empty((*shape, sieves.size + 1) if sieves.size else (0, 0, 0), np.int64))
-
-
-def _for_each(crush, parcels: int, cells: int) -> None:
-    """Call `crush` with slices of the parcels: all at once, or one by one if there are many cells."""
-    large = cells >= _LARGE
-    parts = [slice(k, k + 1) for k in range(parcels)] if large else [slice(None)]
-    # only for a caller of hpgr.simulate: the worker threads of a study have the cores already
-    if large and threading.current_thread() is threading.main_thread():
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            list(pool.map(crush, parts))
-    else:
-        for part in parts:
-            crush(part)

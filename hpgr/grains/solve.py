@@ -71,11 +71,16 @@ class Crushed(NamedTuple):
 
 
 def choose(scene: Scene) -> str:
-    """Return the name of the cheapest solver: "stress only", "closed form", "march" or "lattice"."""
+    """Return the name of the cheapest solver.
+
+    One of "stress only", "closed form", "march", "lattice", and "reduced lattice", which begins above the first break.
+    """
     if scene.resolution.cells == 0:
         return "stress only"
     if scene.exchange is not None and scene.rolls.gap < scene.rolls.entry_gap:  # equal gaps: nothing moves or mixes
-        return "lattice"
+        moving = scene.exchange.segregation > 0 or scene.exchange.mixing > 0
+        product_only = scene.resolution.record == "product" and not scene.exchange.record_startup
+        return "reduced lattice" if moving and product_only else "lattice"
     strength = scene.strength
     if math.isinf(strength.cushioning) and math.isfinite(strength.weibull_modulus):
         return "march" if scene.resolution.record == "cells" else "closed form"
@@ -107,8 +112,8 @@ def crush(scene: Scene, bed: LoadedBed, seed: int, replicate: int) -> Crushed | 
     slices = WHOLE if scene.roll_width is None else scene.roll_width.cut(scene.rolls.gap, scene.rolls.width)
     if solver == "closed form":
         return _closed_form(scene, log_stress, slices)
-    if solver == "lattice":
-        cells, exchanged = lattice.run(scene, log_stress, bed, seed, replicate)
+    if solver in ("lattice", "reduced lattice"):
+        cells, exchanged = lattice.run(scene, log_stress, bed, seed, replicate, reduced=solver != "lattice")
         return _summarised(scene, cells, slices)._replace(exchanged=exchanged)
     return _summarised(scene, march.march(scene, log_stress, slices, seed, replicate), slices)
 

@@ -5,13 +5,17 @@ parcel mass m = rho_b V for all, a cell of size s below an edge rises over it at
 one above it sinks at the same with (sbar - s)+, and cells mix at l rho_b B gammadot sbar^2 / (d m) both ways.
 sbar is the mean size of the parcel, the local mean of its mixture.
 
-Each rate is proportional to the shear rate and so to roll speed, as is everything else: probabilities per time step
-do not depend on speed.
+Under percolation "shear" each rate is proportional to the shear rate and so to roll speed, as is everything else:
+probabilities per time step do not depend on speed. Under "gravity" no grain percolates faster than it falls between
+its neighbours, sqrt(g sbar): the one place where speed enters. Its closed limit at low shear rate is "shear".
 """
 
+import math
 from typing import Literal
 
 from hpgr.fields import Count, Frozen, Number, quantity
+
+_GRAVITY = 9.81  # m s-2
 
 
 class Exchange(Frozen):
@@ -31,6 +35,8 @@ class Exchange(Frozen):
     """Percolation velocity over shear rate and size difference: large grains rise, small ones sink."""
     mixing: Number = quantity(0.1, symbol="B", source="ours", example=0.1, ge=0, le=100)
     """Shear-induced self-diffusion over shear rate and mean size squared."""
+    percolation: Literal["shear", "gravity"] = "shear"
+    """What limits percolation: the shear rate alone, or also how fast gravity lets a grain fall."""
     start: Literal["feed", "crushed"] = "feed"
     """What the machine is filled with at the start: 'feed', or the bed as 'crushed' without exchange."""
     interval: Count = quantity(20, symbol="n_s", source="ours", example=20, ge=1, le=1_000_000)
@@ -38,7 +44,16 @@ class Exchange(Frozen):
     record_startup: bool = False
     """Whether snapshots of the start-up, from the first fill on, come before the steady ones."""
 
-    def percolation(self, sheared, upward, parcel):
+    def ceiling(self, shear_rate):
+        """Return c = A gammadot / sqrt(g) of v = A gammadot |s - sbar| / (1 + c |s - sbar| / sqrt(sbar)), m^-1/2.
+
+        It is 0 where percolation has no ceiling.
+        """
+        return (
+            self.segregation * shear_rate / math.sqrt(_GRAVITY) if self.percolation == "gravity" else 0.0 * shear_rate
+        )
+
+    def rising(self, sheared, upward, parcel):
         """Return the probability per time step and m of size difference that a cell rises over an edge, 1/m.
 
         `upward` is the vertical part of the edge's unit normal.

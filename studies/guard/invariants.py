@@ -75,7 +75,7 @@ def _complete(scene: Scene, result: Result):
     if scene.resolution.cells:
         wanted |= {"passing", "passing_total", "p50", "p80", "p50_total", "p80_total", "breaks_per_cell", "below_floor"}
         wanted |= {"cells": {"size"}, "distributions": {"mass_fraction"}, "product": set()}[scene.resolution.record]
-    if result.attrs["solver"] == "lattice":
+    if result.attrs["solver"].endswith("lattice"):
         wanted |= {"volume", "swaps_per_cell", "exchange_substeps"}
     missing = sorted(wanted - set(result))
     yield not missing, f"missing {', '.join(missing)}"
