@@ -9,8 +9,8 @@ settings.load_profile("house")
 # rooms of studies/ whose tests run processes, files, pages and clusters around the same few kernels; CI's run without
 # the compiler, which takes coverage of hpgr, leaves them out
 PLUMBING = (
-    "accuracy cases cf cluster command_lines docs explore netcdf optimum paper pictures pilot plots ready recorded "
-    "report resume sensitivity space"
+    "accuracy cases cf cluster command_lines docs explore netcdf optimum paper pictures pilot plant plots ready "
+    "recorded report resume sensitivity space"
 )
 
 

@@ -43,9 +43,10 @@ def assemble(
             if name in schema.COORDINATES:  # the same for every case that has it
                 known = values.setdefault(name, value)
             else:
-                stack = values.setdefault(name, _blank((*space.shape, *value.shape), value.dtype))
-                known = stack[result.index]
-                stack[result.index] = value if known.shape == value.shape else 0
+                if name not in values:
+                    values[name] = _blank((*space.shape, *value.shape), value.dtype)
+                known = values[name][result.index]
+                values[name][result.index] = value if known.shape == value.shape else 0
             if known.shape != value.shape:  # an axis over the number of streamlines or sieves makes it ragged
                 uneven.add(name)
     attrs = schema.dataset_attributes(

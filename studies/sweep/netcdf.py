@@ -42,27 +42,17 @@ class _LibraryLock:
     def __init__(self):
         self._own, self._theirs, self._depth = threading.RLock(), combine_locks([NETCDFC_LOCK, HDF5_LOCK]), 0
 
-    def acquire(self, *arguments, **options):
+    def __enter__(self):
         self._own.acquire()
         if self._depth == 0:
             self._theirs.__enter__()
         self._depth += 1
-        return True
 
-    def release(self):
+    def __exit__(self, *_):
         self._depth -= 1
         if self._depth == 0:
             self._theirs.__exit__(None, None, None)
         self._own.release()
-
-    def locked(self):
-        return self._depth > 0
-
-    def __enter__(self):
-        self.acquire()
-
-    def __exit__(self, *_):
-        self.release()
 
     def __reduce__(self):
         return "_LIBRARY"
