@@ -304,25 +304,6 @@ def test_every_case_lost(base, client):
     assert client.submit(sum, [1, 2]).result(timeout=30) == 3
 
 
-def test_default_cluster_listens_on_loopback_only_and_is_closed(base, monkeypatch):
-    import distributed
-
-    seen = []
-
-    class Spy(distributed.LocalCluster):
-        def __init__(self, **options):
-            super().__init__(**options)
-            seen.append((self, options))
-
-    monkeypatch.setattr(distributed, "LocalCluster", Spy)
-    sweep(base, {"rolls.gap": [0.05]}, threads=1)
-    [(cluster, options)] = seen
-    assert cluster.status == distributed.Status.closed
-    assert options["dashboard_address"] == options["worker_dashboard_address"] == "127.0.0.1:0"
-    assert options["threads_per_worker"] == 1
-    assert not options["processes"]
-
-
 def test_a_sweep_leaves_the_process_as_it_was(base, client, tmp_path, monkeypatch):
     """Neither the turns of threads nor the mask of new files is another thread's to change."""
     import os
