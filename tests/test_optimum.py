@@ -60,7 +60,9 @@ def test_one_force_meets_a_bound_and_speed_does_not_matter(client):
     assert best.without_effect == ["rolls.speed does not matter to specific energy, passing 6 mm; it is not varied"]
     assert best.values["rolls.speed"] == scene.rolls.speed
     front = best.tradeoff["best_energy"].values.astype(bool)
-    energy, fine = (quantity_of(name).of(best.tradeoff).values[front, 0] for name in ("energy", "passing 6 mm"))
+    passing = quantity_of("passing 6 mm").of(best.tradeoff).values[:, 0]
+    assert front[passing.argmax()]
+    energy, fine = quantity_of("energy").of(best.tradeoff).values[front, 0], passing[front]
     assert (np.diff(energy[np.argsort(fine)]) >= 0).all()
     assert len(optimum_figure(best).axes) == 2
 
@@ -73,6 +75,9 @@ def test_the_most_throughput_lies_at_the_end_of_the_range(client):
         "rolls.speed at the highest of its range",
     ]
     assert best.values == pytest.approx({"rolls.specific_pressing_force": 2e6, "rolls.speed": 20 * np.pi / 30})
+    finest = best.tradeoff["p80_total"].values[:, 0]
+    assert best.tradeoff["best_throughput"].values[finest == finest.min()].any()
+    assert not best.tradeoff["best_throughput"].values.all()
 
 
 @pytest.mark.parametrize(

@@ -133,6 +133,8 @@ def test_named_scenes_are_compared(base, client):
         assert result["p80_total"].sel(scene=name, gap=0.05).item() == alone["p80_total"]
     assert "scene hard, gap 1200 mm" in report.lost_cases(result)[1]
     assert result["roll_speed"] == base.rolls.speed  # the same in both
+    other = sweep(base, {"scene": {"slow": base, "fast": base.with_values({"rolls.speed": 3.0})}}, client=client)
+    assert "roll_speed" not in other.coords
     assert page.page_data(result, 1e-3, "r")["axes"][0]["changes"][1] == {"strength.reference_strength": 2e6}
     floating = base.with_values({"rolls.specific_pressing_force": 3e6})
     with pytest.raises(ValueError, match="gap floats"):
@@ -190,6 +192,9 @@ def test_two_axes_of_numbers_make_a_map(base, client):
     [dots] = [line for line in figure.axes[2].lines if line.get_marker() == "."]
     assert sorted(zip(*dots.get_data(), strict=True))[0] == pytest.approx((40, 30 / np.pi))
     assert "words" in figure.get_supxlabel()
+    top = next(part for part in figure.axes[2].collections if part.get_array() is not None).get_paths()[-1]
+    assert top.vertices[:, 0].mean() > 50  # most throughput at wide gaps and high speed
+    assert top.vertices[:, 1].mean() > 45 / np.pi
     fineness = np.concatenate([part.get_array() for part in figure.axes[0].collections if part.get_array() is not None])
     assert np.ptp(fineness) > 1
 
