@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import BaseModel, BeforeValidator, ValidationError, model_validator
 
+from hpgr import tables
 from hpgr.fields import (
     Count,
     Density,
@@ -42,6 +43,8 @@ from hpgr.laws.strength import SizeEffectStrength, Strength
 
 DATA = Path(str(files("hpgr") / "data"))  # presets, resolutions, pilot tests
 LEAST_GAP = 1e-6  # m
+_DEEPEST = 8  # levels of a scene file
+_LONG_KEY = re.compile(r"""(?:(?:(?<![\w-])[\w-]++|"[^"\n]*+"|'[^'\n]*+')\s*+\.\s*+){30}""")
 # The largest entry angle the cubic streamlines allow: above it their half width no longer grows with height.
 STEEPEST_ENTRY = 0.5  # (entry gap - gap) / diameter, reached at an entry angle of 60 degrees
 
@@ -305,20 +308,16 @@ class Scene(Frozen):
         0.05
         """
         path = Path(path)
+        text, kind = tables.text_of(path), "JSON" if path.suffix == ".json" else "TOML"
         try:
-            text = path.read_text(encoding="utf-8-sig")
-        except UnicodeDecodeError as error:
-            raise ValueError(f"{path}: byte {error.start} is not UTF-8; save the scene as text in UTF-8") from None
-        if path.suffix == ".json":
-            try:
-                json.loads(text)
-            except json.JSONDecodeError as error:
-                raise ValueError(f"{path}: not JSON: {error}; write it by Scene.model_dump_json()") from None
+            data = _shallow(json.loads(text) if kind == "JSON" else tomllib.loads(_without_long_keys(text)))
+        except RecursionError:
+            raise ValueError(f"{path}: nested too deep; a scene has sections of fields; see the README") from None
+        except ValueError as error:
+            remedy = "write it by Scene.model_dump_json()" if kind == "JSON" else "see the README for a scene file"
+            raise ValueError(f"{path}: not {kind}: {error}; {remedy}") from None
+        if kind == "JSON":
             return cls.model_validate_json(text)
-        try:
-            data = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
-            raise ValueError(f"{path}: not TOML: {error}; see the README for a scene file") from None
         feed = data.get("feed")
         if isinstance(feed, dict) and isinstance(feed.get("table"), str):
             feed["table"] = str(path.parent / feed["table"])
@@ -393,6 +392,24 @@ class Scene(Frozen):
 def preset_names() -> tuple[str, ...]:
     """Return the names of the ready scenes."""
     return tuple(sorted(path.stem for path in (DATA / "presets").glob("*.toml")))
+
+
+def _shallow(data: Any) -> Any:
+    """Return what was read from a scene file, refusing what is nested deeper than the rows of a feed table."""
+    level = [data]
+    for _ in range(_DEEPEST):
+        inner = [each.values() if isinstance(each, dict) else each for each in level if isinstance(each, dict | list)]
+        level = [each for part in inner for each in part]
+    if any(isinstance(each, dict | list) for each in level):
+        raise RecursionError
+    return data
+
+
+def _without_long_keys(text: str) -> str:
+    """Return the text of a TOML file, refusing keys of so many parts that reading them takes memory by their square."""
+    if _LONG_KEY.search(text):
+        raise RecursionError
+    return text
 
 
 def _dotted(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -129,7 +129,7 @@ def _next_sieve(path: str | Path, rows: list["_Row"], size: str, to_mm: float) -
 
 def _lines(path: str | Path) -> list[tuple[int, list[str]]]:
     """Return (line number, stripped cells) of every line that is neither blank nor a comment; at least one."""
-    text = _text_of(path)
+    text = text_of(path)
     kept = [(n, line) for n, line in enumerate(text.splitlines(), start=1) if not _COMMENT.match(line)]
     if max((len(line) for _, line in kept), default=0) > _LONGEST_LINE or len(kept) > _MOST_LINES:
         raise ValueError(
@@ -147,20 +147,29 @@ def _lines(path: str | Path) -> list[tuple[int, list[str]]]:
     return lines
 
 
-def _text_of(path: str | Path) -> str:
+def text_of(path: str | Path) -> str:
+    """Return the text of a file that is a regular one, not too large, and text.
+
+    Raises
+    ------
+    OSError
+        If it cannot be opened.
+    ValueError
+        If it is anything else.
+    """
     status = os.stat(path)  # before it is opened: a pipe would make us wait, a device never end
     if not stat.S_ISREG(status.st_mode):
-        raise ValueError(f"{path}: is no regular file; a table must be one; save it as CSV")
+        raise ValueError(f"{path}: is no regular file; it must be one; save it as text")
     with open(path, "rb") as file:
         data = file.read(_LARGEST + 1)
     if len(data) > _LARGEST:
-        raise ValueError(f"{path}: got more than {_LARGEST:,} bytes; a table must be smaller; give the table alone")
+        raise ValueError(f"{path}: got more than {_LARGEST:,} bytes; it must be smaller; give what is asked for alone")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: byte {error.start} is not UTF-8; save the table as CSV in UTF-8") from None
+        raise ValueError(f"{path}: byte {error.start} is not UTF-8; save it as text in UTF-8") from None
     if "\0" in text:
-        raise ValueError(f"{path}: byte {data.index(0)} is 0, which no text has; save the table as CSV in UTF-8")
+        raise ValueError(f"{path}: byte {data.index(0)} is 0, which no text has; save it as text in UTF-8")
     return text
 
 

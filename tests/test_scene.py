@@ -465,7 +465,15 @@ def test_toml_faults_come_at_once(tmp_path):
         ("a.toml", b"remark = '\xe9'", r"a\.toml: byte 10 is not UTF-8; save"),
         ("a.toml", b"[rolls\ngap =", r"a\.toml: not TOML"),
         ("a.toml", b"", "rolls"),
+        ("a.toml", b"x = " + b"[" * 5000 + b"]" * 5000, r"a\.toml: nested too deep; a scene has sections of fields"),
+        ("a.toml", b".".join([b"a"] * 20_000) + b" = 1", r"a\.toml: nested too deep"),
+        ("a.toml", b"x = {" + b".".join([b"'a'"] * 1000) + b" = 1}", r"a\.toml: nested too deep"),
+        ("a.toml", b"a.b.c.d.e.f.g.h.i.j = 1", r"a\.toml: nested too deep"),
+        ("a.json", b'{"rolls":' * 5000 + b"1" + b"}" * 5000, r"a\.json: nested too deep"),
+        ("a.json", b"9" * 5000, r"a\.json: not JSON"),
+        ("a.toml", b"x" * 11_000_000, r"a\.toml: got more than 10,000,000 bytes"),
     ],
+    ids=lambda value: value[:20] if isinstance(value, bytes) else "",
 )
 def test_files_that_are_no_scene_name_themselves(tmp_path, name, content, words):
     (tmp_path / name).write_bytes(content)
@@ -473,6 +481,8 @@ def test_files_that_are_no_scene_name_themselves(tmp_path, name, content, words)
         Scene.from_file(tmp_path / name)
     with pytest.raises(OSError, match=r"none\.toml"):
         Scene.from_file(tmp_path / "none.toml")
+    with pytest.raises(ValueError, match="/dev/zero: is no regular file"):
+        Scene.from_file("/dev/zero")
 
 
 def test_with_values_changes_only_these():

@@ -243,9 +243,9 @@ def test_missing_pilot_table_is_an_os_error(tmp_path):
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (b"size_\xe9,percent_passing\n1,2\n", "byte 5 is not UTF-8; save the table as CSV in UTF-8"),
+        (b"size_\xe9,percent_passing\n1,2\n", "byte 5 is not UTF-8; save it as text in UTF-8"),
         (b"\x7fELF\0\0", "byte 4 is 0, which no text has"),
-        (b"1" * 11_000_000, "got more than 10,000,000 bytes; a table must be smaller"),
+        (b"1" * 11_000_000, "got more than 10,000,000 bytes; it must be smaller"),
         (b"1" * 200_000, "got 1 lines; a table has at most 10,000 lines of 10,000 characters"),
         (b"1,2\n" * 10_001, "got 10,001 lines; a table has"),
         (b"size_mm,percent_passing\n1,2\n" + b"x" * 9000, r"line 3 'x{57}\.\.\.': got 1 cells"),
@@ -267,7 +267,7 @@ def test_what_is_no_table_gets_one_short_refusal(tmp_path, data, words):
 def test_pipes_and_devices_are_refused_unread(tmp_path):
     os.mkfifo(tmp_path / "pipe.csv")
     for path in (tmp_path / "pipe.csv", "/dev/zero", tmp_path):
-        with pytest.raises(ValueError, match="is no regular file; a table must be one"):
+        with pytest.raises(ValueError, match="is no regular file; it must be one"):
             tables.read_sieve_table(path)
         with pytest.raises(ValueError, match="is no regular file"):
             TableFeed(table=path)
