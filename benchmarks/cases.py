@@ -35,13 +35,13 @@ def median_ms(function, repeats=30):
 def kernel_ms(scene, bed):
     """Return the median time in the crushing kernel of one run, with fresh cells each time."""
     path = march.path(scene, scene.strength.log_stress(solve.crushing_stress(scene, bed)))
-    record = kernels.Record(np.empty(0), np.empty((0, 0, 0), np.float32), np.empty((0, 0, 0), np.int64))
-    lines, breaks = np.arange(len(path.log_stress)), np.empty(len(path.log_stress), np.int64)
-    times = []
+    lines, points = np.arange(path.log_stress.shape[0]), path.log_stress.shape[1]
+    passage = kernels.Passage(lines, lines, 0 * lines, 0 * lines + points)
+    work, record, times = kernels.make_work(scene.resolution.cells), kernels.make_record(), []
     for replicate in range(31):
-        sizes, streams = march.first_cells(scene, 0, [(replicate, line, 0) for line in lines])
+        parcels = march.first_cells(scene, 0, [(replicate, line, 0) for line in lines])
         start = time.perf_counter()
-        kernels.march(sizes, streams, lines, path, march.ore(scene), record, breaks)
+        kernels.crush(parcels, passage, path, march.ore(scene), work, record)
         times.append(time.perf_counter() - start)
     return 1e3 * statistics.median(times[1:])
 

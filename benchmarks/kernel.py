@@ -31,10 +31,10 @@ GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 
 def case(points, cells):
-    """Return a line of cells with its streams, and log(sigma_a / sigma_m) along the streamline."""
+    """Return a parcel, and log(sigma_a / sigma_m) along the streamline."""
     scene = presets.paper().with_values({"resolution.points": points, "resolution.cells": cells})
     log_stress = scene.strength.log_stress(solve.crushing_stress(scene, load_bed(inputs_of(scene))))
-    return *march.first_cells(scene, 0, [(0, 0, 0)]), log_stress[:1]
+    return march.first_cells(scene, 0, [(0, 0, 0)]), log_stress[:1]
 
 
 @functools.cache
@@ -44,11 +44,16 @@ def ore(n):
     return scene, march.ore(scene)
 
 
-def bounded(sizes, streams, log_stress, n):
+def copied(parcels):
+    return kernels.Parcels(*(array.copy() for array in parcels))
+
+
+def bounded(parcels, log_stress, n):
     scene, laws = ore(n)
-    record = kernels.Record(np.empty(0), np.empty((0, 0, 0), np.float32), np.empty((0, 0, 0), np.int64))
-    path = march.path(scene, log_stress)
-    kernels.march(sizes, streams, np.zeros(1, int), path, laws, record, np.empty(1, np.int64))
+    one = np.zeros(1, int)
+    passage = kernels.Passage(one, one, one, one + log_stress.shape[1])
+    work = kernels.make_work(parcels.sizes.shape[1] - 2)
+    kernels.crush(parcels, passage, march.path(scene, log_stress), laws, work, kernels.make_record())
 
 
 @njit
@@ -69,12 +74,12 @@ def _compiled(sizes, streams, log_stress, ore):
                 sizes[p] = np.float32(max(size, kernels.SMALLEST))
 
 
-def compiled(sizes, streams, log_stress, n):
-    _compiled(sizes[0, 1:-1], streams[0, 1:-1], log_stress[0], ore(n)[1])
+def compiled(parcels, log_stress, n):
+    _compiled(parcels.sizes[0, 1:-1], parcels.streams[0, 1:-1], log_stress[0], ore(n)[1])
 
 
-def vectorised(sizes, streams, log_stress, n):
-    laws, sizes, streams = ore(n)[1], sizes[0, 1:-1], streams[0, 1:-1]
+def vectorised(parcels, log_stress, n):
+    laws, sizes, streams = ore(n)[1], parcels.sizes[0, 1:-1], parcels.streams[0, 1:-1]
     for level in log_stress[0]:
         size = sizes.astype(float)
         mean = (np.roll(size, 1) + np.roll(size, -1) + size) / 3
@@ -117,14 +122,14 @@ def _compare(values, needed, times):
 
 def timed(version, line, cells, n, repeats):
     """Return the nanoseconds per cell of each of `repeats` marches over fresh data; the first is left out."""
-    sizes, streams, log_stress = line
+    parcels, log_stress = line
     lines = max(1, CELLS_PER_TIMING // cells)
     found = []
     for _ in range(repeats + 1):
-        fresh = [(sizes.copy(), streams.copy()) for _ in range(lines)]
+        fresh = [copied(parcels) for _ in range(lines)]
         start = time.perf_counter()
-        for pair in fresh:
-            version(*pair, log_stress, n)
+        for each in fresh:
+            version(each, log_stress, n)
         found.append((time.perf_counter() - start) / (lines * cells) * 1e9)
     return found[1:]
 
@@ -143,9 +148,9 @@ def check(line, n):
     """Refuse to compare versions that do not give the same sizes and streams, bit for bit."""
     results = []
     for version in (bounded, compiled, vectorised):
-        sizes, streams = line[0].copy(), line[1].copy()
-        version(sizes, streams, line[2], n)
-        results.append((sizes, streams))
+        parcels = copied(line[0])
+        version(parcels, line[1], n)
+        results.append((parcels.sizes, parcels.streams))
     for pair in results[1:]:
         for mine, other in zip(results[0], pair, strict=True):
             assert np.array_equal(mine[:, 1:-1], other[:, 1:-1])
@@ -189,7 +194,7 @@ def main():
     print("| cells | read | compare | one compare of every cell at every one of 1,600 points |")
     print("|---|---|---|---|")
     for cells in CELLS:
-        sizes = lines(PLAIN_POINTS, cells)[0][0, 1:-1]
+        sizes = lines(PLAIN_POINTS, cells)[0].sizes[0, 1:-1]
         read = rate(functools.partial(_read, sizes.view(np.int32)), cells)
         compare = rate(functools.partial(_compare, sizes, 0.0), cells)
         print(f"| {cells:,} | {4 / read:.0f} GB/s | {1 / compare:.0f} per ns | {1600 * compare:.0f} ns per cell |")
