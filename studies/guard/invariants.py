@@ -20,7 +20,7 @@ from hpgr.scene import Scene
 _ROUNDING = 2.0**-22  # relative; a float32 is good to 2**-24, a quotient or mean of some to a few of that
 _TINY = 1e-36  # below it float32 has fewer digits, and at last none
 _CARRIED = 2e-6  # relative, of a pressing force under which the gap floats; half of it is the rounding to float32
-_CLASSES = 2e-4  # of passing, by which the size classes of a closed form may be off
+_CLASS = math.exp(1 / 30)  # ratio of the ends of a size class of the closed form by classes
 _NIPPING = 1.5  # gaps, top size of the feed from which single grains are nipped
 
 
@@ -111,8 +111,10 @@ def _stresses(scene: Scene, result: Result):
 def _tension(scene: Scene, result: Result):
     """A stress of 0 in a bed that is still compacted was held there, and a state law below 0 asks for tension."""
     *stresses, volumetric, shear = result.doubles("pressure", "shear_stress", "volumetric_strain", "shear_strain")
-    held = [((each[:, 1:] == 0) & (each[:, :-1] > _TINY) & (volumetric[:, 1:] > 0)).any() for each in stresses]
-    law = scene.elasticity
+    law, pressed = scene.elasticity, volumetric[:, 1:] > 0
+    if law.recovery_modulus is not None:  # what was pressed need not be pressed when it has recovered
+        pressed &= volumetric[:, 1:] >= volumetric[:, :-1]
+    held = [((each[:, 1:] == 0) & (each[:, :-1] > _TINY) & pressed).any() for each in stresses]
     c, eta = law.exponent, np.divide(shear, volumetric, out=np.zeros_like(shear), where=volumetric > _TINY)
     pulled = law.bulk_modulus / (c + 1) + 1.5 * law.shear_modulus * c * eta**2 < -1e-3 * law.bulk_modulus
     told = "tension_clamped" in result.flagged()
@@ -180,12 +182,11 @@ def _never_coarser(scene: Scene, result: Result):
     the very grains that entered do, or more.
     """
     if scene.resolution.cells:
-        top, entered = np.float32(scene.feed.largest_grain), _feed_passing(scene, result)
+        top, (least, _) = np.float32(scene.feed.largest_grain), _feed_passing(scene, result)
         for name in {"size", "p50", "p80", "p50_total", "p80_total"} & set(result):
             largest = result[name].max()
             yield largest <= top, f"{name} reaches {largest:g} m, the feed's largest grain is {top:g} m"
-        finer = entered is None or (result["passing"] >= entered - _ROUNDING - _cascaded(scene, result)).all()
-        yield finer, "the product passes a sieve with less than the feed does"
+        yield (result["passing"] >= least - _ROUNDING).all(), "the product passes a sieve with less than the feed does"
 
 
 @_invariant("distributions rise from 0 to 1")
@@ -233,10 +234,10 @@ def _unbroken(scene: Scene, result: Result):
     """Where no stress reaches the strength of any grain, the product is the feed bit for bit."""
     if not scene.resolution.cells or not _nothing_can_break(scene, result):
         return
-    entered = _feed_passing(scene, result)
+    least, most = _feed_passing(scene, result)
     yield not result["breaks_per_cell"].any(), "grains broke under a stress below every strength"
-    same = entered is None or (np.abs(result["passing"] - entered) <= _cascaded(scene, result)).all()
-    yield same, "the product's distribution is not the feed's, though nothing broke"
+    same = (result["passing"] >= least) & (result["passing"] <= most)
+    yield same.all(), "the product's distribution is not the feed's, though nothing broke"
     if "size" in result and result.attrs["solver"] == "march":
         same = (result["size"] == _feed_cells(scene, result)[:, :, None]).all()
         yield same, "sizes are not those of the feed bit for bit, though nothing broke"
@@ -284,12 +285,6 @@ def _flags(scene: Scene, result: Result):
     yield told_words == found_words, f"flags say {found_words}, diagnostics say {told_words}"
 
 
-def _cascaded(scene: Scene, result: Result) -> float:
-    """Return how far a closed form by size classes may be off; others are exact."""
-    exact = math.isinf(scene.strength.scatter) and scene.fragments.size_exponent == 0
-    return 0.0 if exact or result.attrs["solver"] != "closed form" else _CLASSES
-
-
 def _nothing_can_break(scene: Scene, result: Result) -> bool:
     """Return whether the largest crushing stress anywhere stays below the strength of the feed's largest grain.
 
@@ -313,15 +308,22 @@ def _feed_cells(scene: Scene, result: Result) -> np.ndarray:
     return march.first_cells(scene, int(attrs["seed"]), keys)[0][:, 1:-1].reshape(*shape, grid.cells)
 
 
-def _feed_passing(scene: Scene, result: Result) -> np.ndarray | None:
-    """Return the fraction (streamline, sieve) that the feed of each streamline passes; None with exchange."""
+def _feed_passing(scene: Scene, result: Result) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the most (streamline, sieve) that passes of the feed of each streamline.
+
+    They differ where size classes blur the feed, and are 0 and 1 with exchange.
+    """
+    shape, sieves = result["passing"].shape, np.array(scene.resolution.sieves)
     if result.attrs["solver"] == "closed form":
-        law = scene.feed.passing(scene.resolution.sieves).astype(np.float32)
-        return np.broadcast_to(law, result["passing"].shape)
+        classes = math.isfinite(scene.strength.scatter) or scene.fragments.size_exponent != 0
+        ratio, slack = (_CLASS, 2e-4) if classes else (1.0, 0.0)
+        bounds = scene.feed.passing(sieves / ratio) - slack, scene.feed.passing(sieves * ratio) + slack
+        return tuple(np.broadcast_to(each.astype(np.float32), shape) for each in bounds)
     if result.attrs["solver"] != "march":
-        return None
+        return np.zeros(shape), np.ones(shape)
     cells = _feed_cells(scene, result).transpose(1, 0, 2)
-    return _counted(cells.reshape(len(cells), -1), scene)
+    counted = _counted(cells.reshape(len(cells), -1), scene)
+    return counted, counted
 
 
 def _counted(cells: np.ndarray, scene: Scene) -> np.ndarray:
