@@ -212,3 +212,9 @@ def test_points_beyond_the_bed_are_refused():
         with pytest.raises(ValueError, match=rf"point: got {point}; must be within -41 to 40"):
             passing(ds, point=point)
     assert passing(ds, point=-41).identical(passing(ds, point=0))
+
+
+def test_feed_of_a_foreign_file_opens_nothing(product, tmp_path):
+    told = product.attrs["scene"].replace('"feed":{', f'"feed":{{"kind":"table","table":"{tmp_path}/secret","x":0,', 1)
+    with pytest.raises(ValueError, match=r"feed\.table: got the name of a file; a result holds the table itself"):
+        reduction_ratio(product.assign_attrs(scene=told))

@@ -15,9 +15,10 @@ import pytest
 import xarray as xr
 from support import paper
 
+from hpgr.results.metrics import scene_of
 from hpgr.results.schema import STATUS
 from studies.sweep import netcdf, sweep
-from studies.sweep.netcdf import open_result, read_variable, replace, scene_of, shapes_in, write_dataset
+from studies.sweep.netcdf import open_result, read_variable, replace, shapes_in, write_dataset
 
 
 @pytest.fixture(scope="module")

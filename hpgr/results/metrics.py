@@ -4,12 +4,16 @@ Each returns a DataArray with a `streamline` dimension, or, with `total=True`, t
 All stream tubes carry equal mass, so the whole gap is their plain mean (model page, section 4).
 """
 
+import json
+
 import numpy as np
 import xarray as xr
 
 from hpgr.fields import parse
 from hpgr.results.schema import Variable
 from hpgr.scene import Scene
+
+_MOST_SCENE = 1_000_000  # characters of a scene as JSON
 
 
 def passing(dataset: xr.Dataset, sieves=None, point: int = -1, total: bool = False) -> xr.DataArray:
@@ -152,10 +156,29 @@ def reduction_ratio(dataset: xr.Dataset, percent: float = 80, total: bool = Fals
             f"the Dataset sweeps {swept[0]}, but holds the feed of its base scene only; take feed.quantile of "
             "each scene over hpgr.percentile_size instead"
         )
-    scene = Scene.model_validate_json(dataset.attrs["scene"])
-    ratio = scene.feed.quantile(percent / 100) / percentile_size(dataset, percent, total=total)
+    ratio = scene_of(dataset).feed.quantile(percent / 100) / percentile_size(dataset, percent, total=total)
     ratio.attrs = Variable((), "1", f"reduction ratio F{percent:g}/P{percent:g}").attributes()
     return ratio
+
+
+def scene_of(dataset: xr.Dataset) -> Scene:
+    """Return the scene in the attributes of a result that may be anybody's; no file that it names is opened.
+
+    Raises
+    ------
+    ValueError
+        If there is none, or it is none.
+    """
+    text = dataset.attrs.get("scene")
+    if not isinstance(text, str) or len(text) > _MOST_SCENE:
+        raise ValueError(f"attribute scene: got none, or more than {_MOST_SCENE:,} characters; give a study's own file")
+    try:
+        told = json.loads(text)
+        if isinstance(told["feed"].get("table"), str):
+            raise ValueError("feed.table: got the name of a file; a result holds the table itself; correct the scene")
+        return Scene.model_validate(told)
+    except (RecursionError, TypeError, KeyError, AttributeError, json.JSONDecodeError):
+        raise ValueError("attribute scene: is no scene as JSON; give a file that a study has written") from None
 
 
 def gap_throughput(scene: Scene, exit_solid_fraction: float) -> float:

@@ -23,10 +23,10 @@ from hpgr.fields import show, unit_shown
 from hpgr.fields import values_of as values_in
 from hpgr.laws.feed import Feed
 from hpgr.results import metrics
+from hpgr.results.metrics import scene_of
 from hpgr.results.schema import STATUS
 from hpgr.scene import Scene
 from studies.show import report
-from studies.sweep.netcdf import scene_of
 
 MOST_NUMBERS = 4_000_000  # in a page: about 30 MB, which a browser still opens in seconds
 DIGITS, SPREAD_DIGITS = 6, 4  # significant digits of means (float32 has about 7) and of standard deviations

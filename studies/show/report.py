@@ -9,8 +9,8 @@ import xarray as xr
 
 from hpgr.fields import show, unit_shown
 from hpgr.results import flags, metrics
+from hpgr.results.metrics import scene_of
 from hpgr.results.schema import ERRORS, STATUS
-from studies.sweep.netcdf import scene_of
 from studies.sweep.space import SCENE
 
 FIGURES = {  # variable -> heading, how many of its unit make one SI unit
@@ -144,6 +144,7 @@ def points_table(result: xr.Dataset, points: xr.Dataset, found: dict[str, xr.Dat
     for heading, values in found.items():
         means, spreads = values.mean("replicate").values, spread(values).values
         columns[heading] = [_mean_and_spread(*each) for each in zip(means, spreads, strict=True)]
+    columns = {name: texts for name, texts in columns.items() if texts not in axes.values()}  # a force that was set
     count = points.sizes["operating_point"]
     same = {name: texts[0] for name, texts in (axes | columns).items() if count > 1 and len(set(texts)) == 1}
     axes, columns = ({name: each for name, each in part.items() if name not in same} for part in (axes, columns))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from hpgr.results import schema
+from hpgr.results import metrics, schema
 from hpgr.scene import Scene
 from studies.sweep import netcdf
 from studies.sweep.run import Plan
@@ -210,7 +210,7 @@ def open_cases(folder: str | Path) -> xr.Dataset:
         else:
             values[name] = lazy(name, shapes[name], np.dtype(entry.dtype))
     found = _labelled(space, values, told["attrs"] | {"left_out": ", ".join(left_out)})
-    return found.assign_coords(_held(netcdf.scene_of(found), space))
+    return found.assign_coords(_held(metrics.scene_of(found), space))
 
 
 def _manifest(path: Path) -> dict[str, Any]:

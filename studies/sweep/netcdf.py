@@ -1,7 +1,6 @@
 """The only writer and the only reader of files: written whole or not at all, read as if they were an enemy's."""
 
 import hashlib
-import json
 import math
 import os
 import re
@@ -16,8 +15,6 @@ import numpy as np
 import xarray as xr
 from xarray.backends.locks import HDF5_LOCK, NETCDFC_LOCK, combine_locks
 
-from hpgr.scene import Scene
-
 _TEMPORARY = re.compile(r"\.hpgr-[0-9a-f]{16}(\.\w+)?")
 _SEAL = b"hpgr-blake2b:"  # behind the last byte of a file of ours, where HDF5 looks for nothing; then the checksum
 _DIGEST = 16  # bytes
@@ -29,7 +26,6 @@ _MOST_ITEMS, _DEEPEST = (
 )  # variables and groups of a file, attributes of each; groups in groups: ours have none
 _MOST_TEXTS = 100  # in an attribute: one, stored once, may stand at any number of places
 _MOST_BYTES, _MOST_RATIO = 250_000_000, 100  # what a variable may unpack to: this much, or this many times the file
-_MOST_SCENE = 1_000_000  # characters of a scene as JSON
 
 
 class _LibraryLock:
@@ -233,26 +229,6 @@ def shapes_in(path: str | Path) -> dict[str, tuple[int, ...]]:
     """Return the shape of every variable of a NetCDF file, looked at as by `open_result`."""
     with _opened(path) as file:
         return {name: variable.shape for name, variable in file.variables.items()}
-
-
-def scene_of(dataset: xr.Dataset) -> Scene:
-    """Return the scene in the attributes of a result that may be anybody's; no file that it names is opened.
-
-    Raises
-    ------
-    ValueError
-        If there is none, or it is none.
-    """
-    text = dataset.attrs.get("scene")
-    if not isinstance(text, str) or len(text) > _MOST_SCENE:
-        raise ValueError(f"attribute scene: got none, or more than {_MOST_SCENE:,} characters; give a study's own file")
-    try:
-        told = json.loads(text)
-        if isinstance(told["feed"].get("table"), str):
-            raise ValueError("feed.table: got the name of a file; a result holds the table itself; correct the scene")
-        return Scene.model_validate(told)
-    except (RecursionError, TypeError, KeyError, AttributeError, json.JSONDecodeError):
-        raise ValueError("attribute scene: is no scene as JSON; give a file that a study has written") from None
 
 
 @contextmanager

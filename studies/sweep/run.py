@@ -241,8 +241,8 @@ def _batch_size(plan: Plan, workers: int) -> int:
 
 def _to_compile() -> bool:
     """Return whether the compiler has left nothing on disk yet that a run could load."""
-    stats = getattr(kernels.march, "stats", None)  # which plain Python has not
-    return stats is not None and not list(Path(stats.cache_path).glob("kernels.march*.nbi"))
+    stats = getattr(kernels.crush, "stats", None)  # which plain Python has not
+    return stats is not None and not list(Path(stats.cache_path).glob("kernels.crush*.nbi"))
 
 
 def _prediction(plan: Plan, workers: int) -> str:

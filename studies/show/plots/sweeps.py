@@ -11,8 +11,8 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from hpgr.fields import show
+from hpgr.results.metrics import scene_of
 from studies.show import report
-from studies.sweep.netcdf import scene_of
 
 _MOST_LINES = 7  # operating points a panel shows; more are thinned evenly, and the figure says so
 _SAME = 1e-6  # relative difference of curves that are drawn as one
@@ -47,7 +47,7 @@ def sweep_figure(result: xr.Dataset, field: str, sieve: float, caption: str) -> 
     handles, names = panels[-1].get_legend_handles_labels()
     if names:
         others = [name for name in report.axes_of(result) if name not in axis.dims]
-        figure.legend(handles, names, title=_joined(others), loc="outside right lower", fontsize=9)
+        figure.legend(handles, names, title=_joined(others), loc="outside right upper", fontsize=9)
     if not sizes:
         figure.suptitle(_title(result), fontsize=11)
     words = [caption] if caption else []
@@ -162,7 +162,7 @@ def against_axis(panel, values: xr.DataArray, axis: xr.DataArray, heading: str) 
             panel.errorbar([], [], [], label=label, **style)
     alike = "all curves coincide" if len(groups) == 1 else f"{len(groups)} of {count} curves differ"
     alike = f" ({alike})" if len(groups) < count else ""
-    panel.set(xlabel=report.axis_label(axis), ylabel=heading, title=heading.partition(" [")[0] + alike)
+    panel.set(xlabel=report.axis_label(axis), ylabel=heading, title=_panel_title(heading) + alike)
     if values.max() > 0:
         low, high = panel.get_ylim()
         if low > 0 and low > 0.8 * high:  # a flat curve must look flat
@@ -170,6 +170,11 @@ def against_axis(panel, values: xr.DataArray, axis: xr.DataArray, heading: str) 
     panel.ticklabel_format(axis="y", useOffset=False)
     panel.grid(color="0.9")
     return count < total
+
+
+def _panel_title(heading: str) -> str:
+    name = heading.partition(" [")[0]
+    return {"W": "Specific energy"}.get(name, name[0].upper() + name[1:])
 
 
 def _line_name(values: xr.DataArray, lines: xr.DataArray, others: list[str], k: int) -> str:
