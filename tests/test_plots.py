@@ -57,7 +57,7 @@ def test_curves_are_told_apart_without_colour_and_alike_ones_drawn_once(figure):
     assert len(lines_of(upper[2])) == 4  # and the feed
     assert [len(lines_of(panel)) for panel in lower] == [2] * 5
     assert all(len(styles(panel)) == 2 for panel in lower)
-    assert [panel.get_title() for panel in lower[:2]] == ["throughput", "P80 (all curves coincide)"]
+    assert [panel.get_title() for panel in lower[:2]] == ["Throughput", "P80 (all curves coincide)"]
     products, speeds = sorted(figure.legends, key=lambda legend: len(legend.get_texts()), reverse=True)
     assert texts(products) == [f"{gap} mm, 10 rpm (and 1 alike)" for gap in (60, 40, 50)]
     assert "swept: gap, roll speed" in products.get_title().get_text()
