@@ -254,7 +254,7 @@ def _scene_axis(scenes: Any) -> Axis:
             f"{SCENE}: got {scenes!r}; must be named scenes; such as {{'soft': one_scene, 'hard': another_scene}}"
         )
     parts = [name for name in Scene.model_fields if name not in ("remark", "resolution")]  # compared at one resolution
-    return Axis([{part: getattr(scene, part) for part in parts} for scene in scenes.values()], list(scenes))
+    return Axis([{part: getattr(scene, part) for part in parts} for scene in scenes.values()], list(map(str, scenes)))
 
 
 def _columns(name: Any, values: Any) -> Iterator[_Column]:
