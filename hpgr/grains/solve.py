@@ -190,8 +190,8 @@ def _summarised(scene: Scene, cells: Cells, slices: Slices) -> Crushed:
         breaks=slices.share @ breaks,
         below_floor=combined[:, 0],
         passing=combined[:, 1:],
-        percentiles=np.stack([_percentiles(pooled[:, line], slices.share) for line in range(pooled.shape[1])], axis=-1),
-        total_percentiles=_percentiles(pooled, slices.share),
+        percentiles=_percentiles(pooled, slices.share),
+        total_percentiles=_percentiles(_whole(pooled), slices.share)[:, 0],
         size=cells.size,
         mass_fraction=None if cells.classes is None else cells.classes[..., :-1] / scene.resolution.cells,
         along_width=None if scene.roll_width is None else _along_width(slices, passing[..., 1:], pooled),
@@ -199,26 +199,34 @@ def _summarised(scene: Scene, cells: Cells, slices: Slices) -> Crushed:
 
 
 def _along_width(slices: Slices, passing: np.ndarray, pooled: np.ndarray) -> AlongWidth:
-    each = passing.mean(axis=1)
+    each, whole = passing.mean(axis=1), _whole(pooled)
     zones = [_zone(slices, at_edge) for at_edge in (False, True)]
-    return AlongWidth(each, *(zone @ each for zone in zones), *(_percentiles(pooled, zone) for zone in zones))
+    return AlongWidth(each, *(zone @ each for zone in zones), *(_percentiles(whole, zone)[:, 0] for zone in zones))
+
+
+def _whole(cells: np.ndarray) -> np.ndarray:
+    """Return the cells (slice, line, cell) of all lines of each slice as those of one, sorted."""
+    return np.sort(cells.reshape(cells.shape[0], 1, -1), axis=-1)
 
 
 def _percentiles(cells: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Return the percentiles (fraction,) of sorted rows of cells (slice, ..., cell), each slice with its share of mass.
+    """Return the percentiles (fraction, line) of sorted cells (slice, line, cell), each slice with its share of mass.
 
     Of one slice linear between cells as np.quantile's are; of several the first size that reaches the fraction.
     """
     if share.size > 1:
-        cells, share = cells[share > 0].ravel(), share[share > 0]
-        order = np.argsort(cells)
-        reached = share[order // (cells.size // share.size)]
-        np.cumsum(reached, out=reached)  # np.quantile with weights takes twice the memory and three times as long
-        reached /= reached[-1]
-        return cells[order[np.searchsorted(reached, FRACTIONS)]].astype(float)
-    ordered = cells.ravel() if cells.size == cells.shape[-1] else np.sort(cells, axis=None)
-    place = np.array(FRACTIONS) * (ordered.size - 1)
+        cells, share = cells[share > 0], share[share > 0]
+        return np.array([_weighted(cells[:, line], share) for line in range(cells.shape[1])]).T
+    place = np.array(FRACTIONS) * (cells.shape[2] - 1)
     before = place.astype(int)
-    after = np.minimum(before + 1, ordered.size - 1)
-    low, high = (ordered[k].astype(float) for k in (before, after))
-    return low + (high - low) * (place - before)
+    after = np.minimum(before + 1, cells.shape[2] - 1)
+    low, high = (cells[0][:, k].astype(float) for k in (before, after))
+    return (low + (high - low) * (place - before)).T
+
+
+def _weighted(cells: np.ndarray, share: np.ndarray) -> np.ndarray:
+    order = np.argsort(cells, axis=None)
+    reached = share[order // cells.shape[1]]
+    np.cumsum(reached, out=reached)  # np.quantile with weights takes twice the memory and three times as long
+    reached /= reached[-1]
+    return cells.ravel()[order[np.searchsorted(reached, FRACTIONS)]].astype(float)
