@@ -187,3 +187,14 @@ def test_axes_of_text():
     assert report.axis_label(axis) == "elasticity integrator"
     assert report.shown_values(axis).tolist() == ["a"]
     assert report.value_text(axis, "a") == "a"
+
+
+def test_a_value_meant_in_another_unit_is_told_before_the_limits():
+    """A bare 20 in a scene file is 191 rpm; the table alone does not show it."""
+    base = paper({"resolution.cells": 0, "resolution.points": 30, "rolls.speed": 20})
+    first, second = report.flag_line(sweep(base, {"rolls.gap": ["50 mm", "60 mm"]}))
+    assert first.startswith("check the unit: ")
+    assert "rolls.speed 20 is read in rad s-1, 191 rpm; for 20 rpm write '20 rpm'" in first
+    assert second.startswith(
+        "limits of the model that were hit, at how many of 2 operating points: unusual machine (2)"
+    )

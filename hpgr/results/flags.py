@@ -8,7 +8,7 @@ import numpy as np
 
 from hpgr.bed.loaded import LoadedBed
 from hpgr.bed.machine import Performance
-from hpgr.fields import show, values_of
+from hpgr.fields import show, unit_shown, values_of
 from hpgr.grains.solve import Crushed, crushing_stress
 from hpgr.laws.fragments import HELD
 from hpgr.scene import Scene
@@ -109,8 +109,9 @@ def _meant_otherwise(usual: Usual, value: float, field: float | None) -> str:
     if field is None or low <= value <= high or not low <= value * usual.factor <= high:
         return ""
     unit = "rad s-1" if usual.unit == "m s-1" else usual.unit
+    read = unit if unit_shown(unit)[1] == 1 else f"{unit}, {show(field, unit, 4)}"
     meant = f"{field:g} {usual.plant_unit}"
-    return f"; {usual.field} {field:g} is read in {unit}, {show(field, unit, 4)}; for {meant} write '{meant}'"
+    return f"; {usual.field} {field:g} is read in {read}; for {meant} write '{meant}'"
 
 
 def _no_compaction(run: Run) -> str:

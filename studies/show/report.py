@@ -210,14 +210,17 @@ def remarks(result: xr.Dataset, every_flag: bool = False) -> list[str]:
 
 
 def flag_line(result: xr.Dataset) -> list[str]:
-    """Return one line on all limits that were hit, if any were."""
+    """Return one line on all limits that were hit, if any were; before it a value that was meant in another unit."""
     if "flags" not in result:
         return []
     points = operating_points(result)
-    hit = {name: int(((points["flags"] & bit) > 0).any("replicate").sum()) for name, bit in flags.BITS.items()}
+    hit = {flag.name: int(((points["flags"] & flag.bit) > 0).any("replicate").sum()) for flag in flags.FLAGS}
+    texts = (line for text in points["diagnostics"].values.ravel() for line in str(text).splitlines())
+    meant = [f"check the unit: {line.partition(': ')[2]}" for line in texts if "is read in" in line][:1]
     told = ", ".join(f"{name.replace('_', ' ')} ({count})" for name, count in hit.items() if count)
     total = points.sizes["operating_point"]
-    return [f"limits of the model that were hit, at how many of {total} operating points: {told}"] if told else []
+    line = f"limits of the model that were hit, at how many of {total} operating points: {told}"
+    return [*meant, line] if told else []
 
 
 def flagged(result: xr.Dataset) -> list[str]:
