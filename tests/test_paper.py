@@ -228,9 +228,9 @@ def test_words_put_the_figures_of_the_dataset_beside_the_papers(result):
 def test_exchange_reaches_product_and_startup(scene):
     small = scene.with_values({"exchange": {}, "resolution.points": 31, "resolution.cells": 50})
     result = study.study(small, 12, seed=1, assumptions=False)
-    alone = hpgr.simulate(small, seed=1)
+    alone = hpgr.simulate(small.with_values({"resolution.record": "product"}), seed=1)
     np.testing.assert_allclose(result["p80"].values, alone["p80"].values, rtol=1e-6)
-    assert result.attrs["solver"] == "lattice"
+    assert result.attrs["solver"].endswith("lattice")
     still = study.study(small.with_values({"exchange": None}), 12, seed=1, assumptions=False)
     assert not np.array_equal(result["startup_p80"].values, still["startup_p80"].values)
 
