@@ -172,7 +172,8 @@ class _Search:
         found = dict(zip(self.ends, between(self.ends, np.atleast_2d(unit))[0], strict=True))
         for field in set(self.ends) - set(self.free):
             section, _, key = field.partition(".")
-            found[field] = min(max(getattr(getattr(self.own, section), key), self.ends[field][0]), self.ends[field][1])
+            own, (low, high) = getattr(getattr(self.own, section), key, None), self.ends[field]
+            found[field] = low if own is None else min(max(own, low), high)
         return found
 
     def run(self, unit: np.ndarray, replicates: range) -> np.ndarray:
