@@ -298,9 +298,13 @@ class _Search:
         first = self.replicates if self.judges > 1 else 0
         runs = self.run(best, range(first, first + self.judges))
         noise = 2 * runs.std(axis=1, ddof=1) / math.sqrt(self.judges) if self.judges > 1 else np.zeros(len(runs))
-        steps = _RADIUS * np.vstack([np.eye(best.size), -np.eye(best.size)])
-        moved = np.abs(np.array([self.figures(np.clip(best + step, 0, 1)) for step in steps]) - self.figures(best))
-        errors = noise + np.nanmax(moved, axis=0)
+        every = np.eye(best.size)[[field in self.free for field in self.ends]]
+        near = [
+            best,
+            *np.clip(best + _RADIUS * np.vstack([every, -every]), 0, 1),
+        ]  # what is held was not, in the design
+        here, *others = (self.run(unit, range(self.replicates)).mean(axis=1) for unit in near)
+        errors = noise + np.nanmax(np.abs(np.array([here, *others]) - here), axis=0)
         return {one.words: (float(runs[k].mean()), float(errors[k])) for k, one in enumerate(self.every)}
 
     def binding(self, best: np.ndarray, figures: Mapping[str, tuple[float, float]]) -> list[str]:

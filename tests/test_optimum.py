@@ -59,6 +59,7 @@ def test_one_force_meets_a_bound_and_speed_does_not_matter(client):
     assert best.figures["passing 6 mm"][0] == pytest.approx(0.8, abs=2e-3)
     assert best.without_effect == ["rolls.speed does not matter to specific energy, passing 6 mm; it is not varied"]
     assert best.values["rolls.speed"] == scene.rolls.speed
+    assert best.figures["throughput"][1] < 0.01 * best.figures["throughput"][0]
     front = best.tradeoff["best_energy"].values.astype(bool)
     passing = quantity_of("passing 6 mm").of(best.tradeoff).values[:, 0]
     assert front[passing.argmax()]
