@@ -27,6 +27,7 @@ _FIRST = ("K-P1", "K-P3")  # one test does not fix how fineness answers to force
 _EDGE_SHARE = 0.2  # where it was not measured
 _SLICES = 4
 _SAMPLES = 200  # of the posterior
+_FORCES = 0.1  # least range of forces, in logs, that tells an exponent
 # Laws of real machines with what is held of them, and where the fit of a preset starts: between ores, so that a blind
 # test is none of those the preset is fitted to (docs/validation.md).
 START = {
@@ -229,10 +230,10 @@ def comparison(scene: Scene, tests: Sequence[Any], baselines: bool) -> "xr.Datas
     measured = _exponents([(test, SimpleNamespace(**_measured(test))) for test in tests])
     values[0, 0] = [measured.get(name, math.nan) for name in _ERRORS]
     for k, (name, fit) in enumerate(named, start=1):
-        print(name, flush=True)
         for out in range(3):
             found, constants[k] = _left_out(tests, fit, out)
             values[k, out] = [_errors(found).get(error, math.nan) for error in _ERRORS]
+        print(name, *(f"{median:.2f}/{largest:.2f}" for median, largest in values[k, :, :2]), flush=True)
     names = np.array(["measured", *(name for name, _ in named)], object)
     figures = [f"{name}: {words} [{unit}]" for name, (unit, words) in _ERRORS.items()]
     own = schema.Variable
@@ -315,17 +316,12 @@ def _exponents(pairs: Sequence[tuple[Any, Any]]) -> dict[str, float]:
     """Return the exponents of gap and specific energy on force, over tests of the first feed."""
     kept = [(test, said) for test, said in pairs if np.array_equal(test.feed, pairs[0][0].feed)]
     force = np.log([test.specific_pressing_force for test, _ in kept])
-    if np.ptp(force) < 0.1:
-        return {}
-    names = {
-        "gap_exponent": [said.gap for _, said in kept],
-        "energy_exponent": [said.power / said.throughput for _, said in kept],
+    values = {
+        "gap_exponent": np.array([getattr(said, "gap", math.nan) for _, said in kept]),
+        "energy_exponent": np.array([said.specific_energy for _, said in kept]),
     }
-    return {
-        name: float(np.polyfit(force, np.log(values), 1)[0])
-        for name, values in names.items()
-        if np.all(np.isfinite(values))
-    }
+    known = {name: one for name, one in values.items() if np.isfinite(one).all() and np.ptp(force) > _FORCES}
+    return {name: float(np.polyfit(force, np.log(one), 1)[0]) for name, one in known.items()}
 
 
 def _coverage(pairs: Sequence[tuple[Any, Any]]) -> dict[str, float]:
