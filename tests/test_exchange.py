@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy import linalg, special, stats
+from scipy import special, stats
 from support import COMPILED, GOLDEN, SIGMAS, paper, sized, split_mix
 
 from hpgr import presets, simulate
@@ -301,19 +301,6 @@ def test_a8_two_boxes_mix_exponentially(chance):
     assert np.mean(column.sizes[0] == 1) == found
 
 
-@pytest.mark.parametrize("chance", [SPARSE, DENSEST])
-def test_a8_scatter_over_seeds_is_binomial(chance):
-    """Sum of squared z over seeds is chi-square; each tail 1e-6. Catches swaps that are drawn in common."""
-    cells, seeds = 400, sized(200, 40)
-    total = 0.0
-    for seed in range(seeds):
-        column = halves(cells, mixing=chance, seed=seed)
-        column.swap(3)
-        expected = 0.5 + (1 - 2 * chance) ** 3 / 2
-        total += (np.sum(column.sizes[1] == 2) - cells * expected) ** 2 / (cells * expected * (1 - expected))
-    assert stats.chi2.isf(1 - 1e-6, seeds) < total < stats.chi2.isf(1e-6, seeds)
-
-
 def agrees(counts, probabilities):
     """Chi-square of counts at 1e-6, classes of less than 8 expected pooled."""
     counts, expected = np.asarray(counts, float), np.sum(counts) * np.asarray(probabilities, float)
@@ -555,44 +542,6 @@ def error_function(boxes, spread):
     edges = (np.arange(boxes + 1) - boxes // 2) / spread
     integral = edges * special.erfc(edges) - np.exp(-(edges**2)) / math.sqrt(math.pi)
     return np.diff(integral) * spread / 2
-
-
-def test_variance_of_a_tracer_grows_by_exactly_2p_over_1_minus_p():
-    """Edges in order carry a cell up several boxes in one substep, and down one; on the average it stays.
-
-    Its mean displacement is -P + (1 - P)(P + P^2 + ...) = 0, its variance 2P / (1 - P): diffusion is that of
-    P / (1 - P), an error of first order in the time step which the substeps keep below P = 1/2.
-    """
-    boxes, substeps = 81, 10
-    for chance in (0.01, 0.1, 0.25):
-        share = np.zeros(boxes)
-        share[boxes // 2] = 1.0
-        pairs = [(k, k + 1) for k in range(boxes - 1)]
-        for _ in range(substeps):
-            share = mean_field(share, pairs, [chance] * len(pairs))
-        place = np.arange(boxes) - boxes // 2
-        assert share @ place == pytest.approx(0, abs=1e-9)
-        assert share @ place**2 == pytest.approx(substeps * 2 * chance / (1 - chance), rel=1e-6)
-
-
-def test_diffusion_converges_to_the_error_function_at_order_1_in_dt_and_2_in_d():
-    # time: the same D t = 8 boxes squared in more and more substeps, against the boxes' exact solution
-    boxes = 60
-    laplacian = np.diag(np.r_[1.0, np.full(boxes - 2, 2.0), 1.0]) - np.eye(boxes, k=1) - np.eye(boxes, k=-1)
-    start = np.repeat([1.0, 0.0], boxes // 2)
-    exact_boxes = linalg.expm(-8 * laplacian) @ start
-    errors = [np.abs(step_profile(boxes, 8 / n, n) - exact_boxes).max() for n in sized((40, 80, 160, 320), (40, 80))]
-    orders = np.diff(np.log(errors)) / -math.log(2)
-    assert np.all(abs(orders - 1) < 0.15), orders
-    # space: boxes' exact solution at D t = 2, 8, 32 boxes squared, that is d halved twice, against erfc
-    errors = []
-    for square in (2.0, 8.0, 32.0):
-        boxes = 20 * round(math.sqrt(square / 2))
-        laplacian = np.diag(np.r_[1.0, np.full(boxes - 2, 2.0), 1.0]) - np.eye(boxes, k=1) - np.eye(boxes, k=-1)
-        found = linalg.expm(-square * laplacian) @ np.repeat([1.0, 0.0], boxes // 2)
-        errors.append(np.abs(found - error_function(boxes, 2 * math.sqrt(square)))[boxes // 4 : -boxes // 4].max())
-    orders = np.diff(np.log(errors)) / -math.log(2)
-    assert np.all(abs(orders - 2) < 0.4), orders
 
 
 @pytest.mark.parametrize(("square", "substeps"), [(4.0, 400), (4.0, 40)])

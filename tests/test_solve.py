@@ -3,7 +3,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from support import KS, SIGMAS, crush, first_cells, paper, sized
+from support import KS, SIGMAS, crush, first_cells, paper, sized, under
 
 from hpgr import presets, simulate
 from hpgr.bed.loaded import inputs_of, load_bed
@@ -39,6 +39,13 @@ def test_the_cheapest_solver_is_chosen_and_told(values, solver):
     scene = paper(values)
     assert solve.choose(scene) == solver
     assert simulate(scene).attrs["solver"] == solver
+
+
+def test_only_compacting_points_crush():
+    """Eq. 1's Heaviside: pressure that is left while the bed dilates crushes nothing."""
+    bed = under(np.full((1, 3), 5e6))
+    bed.kinematics.volumetric_rate[0, 1] = -1.0
+    assert solve.crushing_stress(paper(), bed).tolist() == [[5e6, 0.0, 5e6]]
 
 
 def test_closed_form_draws_no_cells(monkeypatch):
