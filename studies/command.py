@@ -173,6 +173,17 @@ def ranges(texts: Sequence[str]) -> dict[str, tuple]:
     return found
 
 
+def posterior(path: Path) -> dict[str, list[float]]:
+    """Return samples of scene fields of a calibration's file, such as outputs/pilot.nc: variables along `sample`."""
+    from studies.sweep.netcdf import open_result
+
+    with open_result(path) as dataset:
+        found = {name: value.values.tolist() for name, value in dataset.data_vars.items() if value.dims == ("sample",)}
+    if not found:
+        raise ValueError(f"{path}: has no samples of scene fields along 'sample'; give the file of a studies.pilot")
+    return found
+
+
 def _number(field: str, text: str) -> Any:
     """Return the text of a value as the number it is, where the field has no unit."""
     if field_info(field).unit == "1":

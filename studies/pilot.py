@@ -172,7 +172,8 @@ def _models(scene: Scene, known: Sequence[Any], fit: Any, baselines: bool) -> tu
     print(f"fitting to {', '.join(test.name for test in known)} (about a minute)", flush=True)
     found = calibration.fit_tests(scene, known, fit)
     found = calibration.validated(found) if len(known) > 2 else found
-    fields = [calibration.PARAMETERS[name].field for name in found.problem.names]
+    fitted = [calibration.PARAMETERS[name] for name in found.problem.names]
+    fields = [field for one in fitted for field in (one.field, one.follower) if field]
     drawn = found.sample(_SAMPLES, seed=0)
     samples = {name: np.array([_field(one, name) for one in drawn]) for name in fields}
     models = [Model("hpgr", found.predict, str(found))]

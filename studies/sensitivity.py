@@ -207,10 +207,7 @@ def main(options: Options) -> Report:
     """Write the indices of the command line's ranges."""
     ranges: dict[str, Any] = line.ranges(options.vary) if options.vary or not options.posterior else {}
     if options.posterior is not None:
-        from studies.sweep.netcdf import open_result
-
-        with open_result(options.posterior) as dataset:
-            ranges |= {name: samples.values for name, samples in dataset.data_vars.items()}
+        ranges |= line.posterior(options.posterior)
     figures = options.figures or (*FIGURES, f"passing {options.sieve}")
     scene = line.base_scene(options)
     result = sensitivity(scene, ranges, figures, options.sample, options.seed, threads=options.workers, progress=True)

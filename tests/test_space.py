@@ -235,3 +235,29 @@ def test_command_line_draws_a_design_and_compares_scenes(tmp_path, monkeypatch, 
     assert main(both) == 0
     assert main([*both[:-2], "khd_pilot", "--out", "both"]) == 2  # the file is of other scenes
     assert "result of another command" in capsys.readouterr().err
+
+
+def test_bands_of_a_calibration_apart_from_chance(tmp_path, monkeypatch, capsys):
+    """Density moves throughput alone, by as much as it scatters; chance moves P80 alone."""
+    from studies.show.plots.bands import bands, bands_figure
+
+    monkeypatch.chdir(tmp_path)
+    drawn = {"bed.solid_density": np.linspace(2400, 3000, 40), "strength.reference_strength": np.full(40, 8.4e5)}
+    file = xr.Dataset({name: ("sample", values) for name, values in drawn.items()} | {"other": ("test", [1.0])})
+    netcdf.write_dataset(file, "posterior.nc")
+    tiny = ["--replicates", "2", "--cells", "30", "--points", "20", "--streamlines", "2"]
+    tiny += ["--calibration", "posterior.nc"]
+    assert main([*tiny, "--gap", "50 mm", "60 mm"]) == 0
+    assert " to " in capsys.readouterr().out.splitlines()[1]
+    with xr.open_dataset("outputs/gap_sweep.nc") as result:
+        assert result["p80_total"].dims == ("gap", "sample", "replicate")
+        found = bands(result.load(), 1e-3)
+    throughput, p80 = found["throughput [t/h]"], found["P80 [mm]"]
+    width = ((throughput.high - throughput.low) / throughput.mean).values
+    assert width == pytest.approx(0.95 * np.ptp(drawn["bed.solid_density"][:32]) / 2638, rel=0.02)
+    assert (throughput.noise == 0).all()
+    assert (p80.high == p80.low).all()
+    assert (p80.noise > 0).all()
+    assert len(bands_figure(result, 1e-3, "words").axes) == 4
+    assert main([*tiny[:-1], "outputs/gap_sweep.nc", "--out", "other"]) == 2
+    assert "no samples" in capsys.readouterr().err

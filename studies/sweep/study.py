@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+_DRAWS = 32  # samples of a calibration
+
+
 class Study(NamedTuple):
     """One ready sweep: its name, the option of its main axis, default values as multiples, and its message."""
 
@@ -43,6 +46,8 @@ class Options:
     vary: line.Vary = ()
     sample: Annotated[int | None, shown_as("N")] = None
     """Points of a Sobol design, drawn over the fields that --vary gives as a range, lo..hi."""
+    calibration: Annotated[Path | None, shown_as("FILE")] = None
+    """File of studies.pilot: 32 of its samples are run at every operating point; bands tell what it leaves open."""
     scene: line.SceneNames = ("paper",)
     replicates: line.Replicates = 3
     level: line.Level = None
@@ -167,6 +172,11 @@ def _space(study: Study, options: Options, scene: Scene, given: dict[str, list],
     if main not in given and not ranges:
         given = {main: _default_values(study, scene)} | given
     space = {main: given[main]} | given if main in given else given
+    if options.calibration is not None:
+        if ranges:
+            raise ValueError("--calibration: got it beside --sample; give one of them")
+        drawn = line.posterior(options.calibration)
+        return space | {tuple(drawn): list(zip(*drawn.values(), strict=True))[:_DRAWS]}
     return (sobol_design(ranges, options.sample, options.seed) if ranges else {}) | space
 
 
@@ -213,6 +223,11 @@ def _report(field: str, caption: str, result: "xr.Dataset", sieve: float, option
     sayings = [*report.change(result, field), caption]
     lines = [report.table(result, sieve), *report.remarks(result, options.flags), *sayings]
     drawn = line.figure(lambda: plant.picture(result, field, sieve, "\n".join(sayings)))
+    if options.calibration is not None:
+        from studies.show.plots.bands import bands_figure, bands_table
+
+        lines[0] = bands_table(result, sieve)
+        drawn = line.figure(lambda: bands_figure(result, sieve, "\n".join(sayings)))
     return Report(lines, [result, *[drawn] * options.plot, lambda path, _: _write_csv(path, result, sieve)], lost)
 
 
