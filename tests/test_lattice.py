@@ -274,6 +274,17 @@ def test_same_seed_same_bits_other_seed_other_bits():
         assert not np.array_equal(first["size"], simulate(scene, seed=seed, replicate=replicate)["size"])
 
 
+def test_all_cores_give_the_bits_of_one(monkeypatch):
+    """Cells in more than one share, which threads take in any order."""
+    scene = mixed(STRONG | {"resolution.cells": sized(600, 40), "resolution.points": 8})
+    alone = simulate(scene, seed=24)
+    monkeypatch.setattr(rooms, "_SHARE", sized(256, 16))
+    shared = simulate(scene, seed=24)
+    monkeypatch.setattr(rooms.march, "_LARGE", 1)
+    assert shared.identical(simulate(scene, seed=24))
+    assert not shared.identical(alone)  # each share draws its own numbers
+
+
 def test_swaps_of_seeds_replicates_and_steps_differ(monkeypatch):
     """No two time steps of any of these runs draw from the same key; nor do turns, each of which has its own of it."""
     keys, swap = [], kernels.swap
