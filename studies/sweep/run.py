@@ -223,7 +223,7 @@ def _computed(plan: Plan, client: Any, task: Task, progress: bool) -> Iterator[C
     if progress:
         say(_prediction(plan, workers))
         if _to_compile():
-            say("the first run compiles the model, which takes about a minute, once")
+            say("the first run compiles the model, which takes some ten seconds, once")
     with progress_bar(total, progress, "cases", "{rate_fmt}, {remaining} left", total - plan.left) as bar:
         for result in dispatched(plan, client, task):
             yield result
