@@ -99,7 +99,8 @@ def _products(panels, result: xr.Dataset, sieve: float) -> bool:
         flat = _across_half_gap(panel, across[name].isel(operating_point=chosen), result["xi"].values, named)
         panel.set(title=f"{title} to the roll" + (", flat within its noise" if flat else ""), ylabel=unit)
     handles, names = panels[0].get_legend_handles_labels()
-    place = {"loc": "outside upper center", "ncols": len(names), "fontsize": 9, "frameon": False}
+    columns = max(200 // (10 + max(map(len, names), default=1)), 1)  # that the figure is wide enough for
+    place = {"loc": "outside upper center", "ncols": min(columns, len(names)), "fontsize": 9, "frameon": False}
     panels[0].figure.legend(handles, names, title=_title(result), **place)
     _product_sizes(panels[2], points.isel(operating_point=chosen), scene_of(result).feed)
     return thinned
