@@ -7,6 +7,7 @@ it, among unbroken feed, the mean field of the same swaps is exact in the limit 
 import math
 import os
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -163,8 +164,8 @@ class Lattice:
         same snapshot without exchange, so that both share their random numbers.
     each : callable
         A map over parts of the work.
-    entering : list of callable, optional
-        Quantiles of what enters each streamline; the feed's if not given.
+    entering : callable, optional
+        Quantile function (streamline, ...) of what enters; the feed's if not given.
 
     Attributes
     ----------
@@ -185,7 +186,7 @@ class Lattice:
         replicate: int,
         steady: dict[int, int],
         each: Callable = map,
-        entering: list[Callable] | None = None,
+        entering: Callable | None = None,
     ):
         self._scene, self._rates, self._steady, self._each = scene, rates, steady, each
         self._seed, self._replicate = seed, replicate
@@ -196,7 +197,7 @@ class Lattice:
         self._nothing = kernels.make_record()
         self._home = np.arange(log_stress.size).reshape(log_stress.shape)
         self.slots = self._home
-        self._entering = entering or [scene.feed.quantile] * log_stress.shape[0]
+        self._entering = entering
         self.swaps, self.most_substeps = 0, 0
         source = np.random.SeedSequence(seed, spawn_key=(replicate,))
         self._swap_key = int(source.generate_state(1, np.uint64)[0])
@@ -233,9 +234,9 @@ class Lattice:
 
     def _let_in(self, step: int) -> None:
         """Put new parcels in the first points; at the first fill as the bed would have brought them there."""
-        for line, slots in enumerate(self.slots[:, :1] if step else self.slots):
-            keys = [self._key(line, step - point) for point in range(slots.size)]
-            fresh = march.first_cells(self._scene, self._seed, keys, self._entering[line])
+        for point, slots in enumerate(self.slots[:, :1].T if step else self.slots.T):
+            keys = [self._key(line, step - point) for line in range(slots.size)]
+            fresh = march.first_cells(self._scene, self._seed, keys, self._entering)
             for mine, new in zip(self.parcels, fresh, strict=True):
                 mine[slots] = new
         if step == 0 and self._scene.exchange.start == "crushed":
@@ -340,8 +341,7 @@ def run(
     first = max(min(unbroken, grid.points - 1) - _MARGIN, 0) if reduced else 0
     if first > 0:
         above = settle(scene, within(rates, grid.points, 0, unbroken), (grid.streamlines, unbroken), first)
-        entering = [_quantile_of(scene, shares) for shares in above.entering]
-        swaps, substeps = above.swaps, above.substeps
+        swaps, substeps, entering = above.swaps, above.substeps, _quantile_of(scene, above.entering)
         rates = within(rates, grid.points, first, grid.points)
     last = grid.points - 1 - first  # the step at which the first parcel that entered is at the exit
     steady = [last + k * wishes.interval for k in range(grid.snapshots)]
@@ -377,6 +377,8 @@ def run(
 
 
 def _quantile_of(scene: Scene, shares: np.ndarray) -> Callable:
-    """Return the quantile function of a mixture of the feed's classes of equal mass."""
-    passing, feed = np.append(0.0, np.cumsum(shares)), np.linspace(0, 1, shares.size + 1)
-    return lambda fraction: scene.feed.quantile(np.interp(fraction, passing / passing[-1], feed))
+    """Return the quantile function (streamline, ...) of mixtures (streamline, class) of the feed's classes."""
+    passing = np.pad(np.cumsum(shares, axis=1), ((0, 0), (1, 0)))
+    feed = np.linspace(0, 1, passing.shape[1])
+    mixed = [partial(np.interp, xp=each / each[-1], fp=feed) for each in passing]
+    return lambda fraction: scene.feed.quantile(np.stack([one(row) for one, row in zip(mixed, fraction, strict=True)]))
