@@ -828,7 +828,7 @@ def swap(parcels, slots, edges, means, largest, key, first, last, numbers, halve
 
 
 @_compiled
-def swap_mean_field(fractions, sizes, edges, means, swaps):
+def swap_mean_field(fractions, sizes, edges, means, swaps, ups, downs):
     """Swap as the lattice does in the limit of many cells.
 
     Parameters
@@ -841,21 +841,28 @@ def swap_mean_field(fractions, sizes, edges, means, swaps):
         As in `swap`.
     swaps : float64 (edge,)
         Expected swaps of a cell index across each edge, added to.
+    ups, downs : float64 (class,)
+        Work space.
     """
     for turn in range(edges.turns.size):
         e = edges.turns[turn]
         lower, upper, mixing = edges.pairs[e, 0], edges.pairs[e, 1], edges.mixing[e]
-        drive = _drive(edges.rise[e], 0.0, means[lower], means[upper], edges.ceiling[e])
-        rising = sinking = 0.0
+        drive = _drive(edges.rise[e], mixing, means[lower], means[upper], edges.ceiling[e])
+        rise, mixing, below, above, held_below, held_above = drive
+        rising = sinking = mixing
         for c in range(sizes.size):
-            rising += fractions[lower, c] * _chance(sizes[c], np.inf, drive)
-            sinking += fractions[upper, c] * _chance(0.0, sizes[c], drive)
+            up, down = max(sizes[c] - below, 0.0), max(above - sizes[c], 0.0)
+            ups[c], downs[c] = rise * up / (1.0 + held_below * up), rise * down / (1.0 + held_above * down)
         for c in range(sizes.size):
-            up = fractions[lower, c] * (mixing + _chance(sizes[c], np.inf, drive) + sinking)
-            down = fractions[upper, c] * (mixing + rising + _chance(0.0, sizes[c], drive))
-            fractions[lower, c] -= up - down
-            fractions[upper, c] += up - down
-        swaps[e] += mixing + rising + sinking
+            rising += fractions[lower, c] * ups[c]
+            sinking += fractions[upper, c] * downs[c]
+        for c in range(sizes.size):
+            flow = fractions[lower, c] * (mixing + ups[c] + sinking) - fractions[upper, c] * (
+                mixing + rising + downs[c]
+            )
+            fractions[lower, c] -= flow
+            fractions[upper, c] += flow
+        swaps[e] += rising + sinking - mixing
 
 
 # --- the closed form ----------------------------------------------------------------------------------------

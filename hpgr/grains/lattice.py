@@ -296,7 +296,7 @@ def settle(scene: Scene, rates: SwapRates, shape: tuple[int, int], first: int) -
     """Return what enters a lattice at point `first` of a bed (streamline, point) where nothing breaks."""
     sizes = scene.feed.quantile((np.arange(8 * _CLASSES) + 0.5) / (8 * _CLASSES)).reshape(_CLASSES, 8).mean(axis=1)
     fractions, most = np.full((*shape, _CLASSES), 1 / _CLASSES), 1
-    flat, swaps = fractions.reshape(-1, _CLASSES), np.zeros(len(rates.pairs))
+    flat, swaps, work = fractions.reshape(-1, _CLASSES), np.zeros(len(rates.pairs)), np.empty((2, _CLASSES))
 
     def shift():
         fractions[:, 1:], fractions[:, 0] = fractions[:, :-1].copy(), 1 / _CLASSES
@@ -305,16 +305,16 @@ def settle(scene: Scene, rates: SwapRates, shape: tuple[int, int], first: int) -
 
     for _ in range(shape[1]):  # what is at the last point by then has seen the steady field of all others
         edges, substeps, means = shift()
-        kernels.swap_mean_field(flat, sizes, edges, means, swaps)
+        kernels.swap_mean_field(flat, sizes, edges, means, swaps, *work)
         most = max(most, substeps)
     # The lattice swaps within itself, and not with what is above: its first parcels have done that when they enter.
     # Or large grains, which rise, would be carried in and never out
     edges, _, means = shift()
     outside = (rates.pairs % shape[1] < first).sum(axis=1)[edges.turns]  # points of an edge above the lattice
     swaps[:] = 0
-    kernels.swap_mean_field(flat, sizes, edges._replace(turns=edges.turns[outside == 1]), means, swaps)
+    kernels.swap_mean_field(flat, sizes, edges._replace(turns=edges.turns[outside == 1]), means, swaps, *work)
     entering = fractions[:, first].copy()
-    kernels.swap_mean_field(flat, sizes, edges._replace(turns=edges.turns[outside == 2]), means, swaps)
+    kernels.swap_mean_field(flat, sizes, edges._replace(turns=edges.turns[outside == 2]), means, swaps, *work)
     return Above(entering, swaps.sum(), most)
 
 
