@@ -3,8 +3,9 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from support import KS, SIGMAS, critical_log_stress, draw, ks_distance, laws, march, sized, streams
+from support import KS, SIGMAS, critical_log_stress, draw, ks_distance, laws, march, paper, sized, streams
 
+from hpgr import simulate
 from hpgr.grains.closed_form import _cascade, crushed, crushed_passing, expected_breaks, percentile
 from hpgr.laws.feed import PowerLawFeed, RosinRammlerFeed, SingleFeed, TableFeed, UniformFeed
 
@@ -126,3 +127,13 @@ def test_cascade_has_the_papers_law_as_its_limit(feed):
     assert breaks == pytest.approx(expected_breaks(feed, critical, 0.35), abs=6e-3)
     sharp = crushed(feed, laws(k=100.0).strength, law.fragments, critical)[0](size=sizes[:, None])
     assert np.abs(sharp - exact).max() < 0.02
+
+
+def test_where_nothing_breaks_the_classes_leave_the_feed_itself():
+    values = {"strength.cushioning": math.inf, "fragments.size_exponent": 0.3, "resolution.record": "product"}
+    dataset = simulate(paper(values | {"strength.reference_strength": 1e15}))
+    expected = paper().feed.passing(dataset["sieve"].values).astype(np.float32)
+    assert np.array_equal(dataset["passing_total"], expected)
+    for floor in ("59.9 mm", "60 mm", "100 mm"):  # once a negative number of classes
+        dataset = simulate(paper(values | {"strength.scatter": 3.0, "fragments.size_floor": floor}))
+        np.testing.assert_allclose(dataset["passing_total"], expected, atol=2e-3)

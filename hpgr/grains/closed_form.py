@@ -33,6 +33,9 @@ def crushed(feed: Feed, strength: Strength, fragments: Fragments, critical: np.n
         passing = partial(crushed_passing, feed, critical=critical, gamma=fragments.exponent)
         return passing, expected_breaks(feed, critical, fragments.exponent)
     edges, cumulative, breaks = _cascade(feed, strength, fragments, critical.ravel())
+    if not breaks.any():  # the feed itself, not its classes
+        critical = np.full(critical.shape, np.inf)
+        return partial(crushed_passing, feed, critical=critical, gamma=fragments.exponent), np.zeros(critical.shape)
     return partial(_between, edges, cumulative.reshape(-1, *critical.shape)), breaks.reshape(critical.shape)
 
 
