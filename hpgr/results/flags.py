@@ -8,7 +8,7 @@ import numpy as np
 
 from hpgr.bed.loaded import LoadedBed
 from hpgr.bed.machine import Performance
-from hpgr.fields import show, unit_shown, values_of
+from hpgr.fields import show, unit_shown
 from hpgr.grains.solve import Crushed, crushing_stress
 from hpgr.laws.fragments import HELD
 from hpgr.scene import Scene
@@ -86,21 +86,27 @@ def names(bits: int) -> list[str]:
 
 
 def _unusual_machine(run: Run) -> str:
-    given, rolls = values_of(run.scene), run.scene.rolls
-    values = {name: given.get(usual.field) for name, usual in USUAL.items()} | {
+    rolls, given = run.scene.rolls, {name: _given(run.scene, usual.field) for name, usual in USUAL.items()}
+    values = given | {
         "surface speed": rolls.surface_speed,
         "specific pressing force": run.performance.specific_pressing_force,
         "specific energy": run.performance.specific_energy,
         "gap over diameter": rolls.gap / rolls.diameter,
         "exit solid fraction": float(run.bed.stress.solid_fraction[:, -1].mean()),
     }
-    told = ((name, values[name], usual, given.get(usual.field)) for name, usual in USUAL.items())
+    told = ((name, values[name], usual, given[name]) for name, usual in USUAL.items())
     return "; ".join(
         f"{name} {show(value, usual.unit, 4)} (usual {show(usual.low, usual.unit)} to {show(usual.high, usual.unit)}"
         f"{_meant_otherwise(usual, value, field)})"
         for name, value, usual, field in told
         if value is not None and not usual.low <= value <= usual.high
     )
+
+
+def _given(scene: Scene, field: str) -> float | None:
+    """Return the value of a scene field; None for a law that has no such field."""
+    section, _, key = field.partition(".")
+    return getattr(getattr(scene, section, None), key, None)
 
 
 def _meant_otherwise(usual: Usual, value: float, field: float | None) -> str:
@@ -139,7 +145,7 @@ def _single_particle_nipping(run: Run) -> str:
 
 
 def _no_limit_of_steps(run: Run) -> str:
-    exponent = values_of(run.scene.elasticity).get("exponent", 0.0)
+    exponent = getattr(run.scene.elasticity, "exponent", 0.0)
     words = f"with elasticity.exponent {exponent:g}, below 0, stresses need not converge as time steps shrink"
     return words if exponent < 0 and run.bed.stress.pressure.any() else ""
 
@@ -153,7 +159,7 @@ def _few_cells(run: Run) -> bool:
 
 
 def _feed_below_critical(run: Run) -> str:
-    scattered = math.isfinite(values_of(run.scene.strength).get("scatter", math.inf))
+    scattered = math.isfinite(getattr(run.scene.strength, "scatter", math.inf))
     if not run.broken or scattered:
         return ""
     critical = _critical_size(run)
@@ -170,7 +176,7 @@ def _critical_size(run: Run) -> float:
 
 def _fragment_exponent_held(run: Run) -> str:
     law, largest = run.scene.fragments, run.scene.feed.largest_grain
-    if run.crushed is None or not values_of(law).get("size_exponent"):
+    if run.crushed is None or not getattr(law, "size_exponent", 0.0):
         return ""
     parents = (min(max(_critical_size(run), law.size_floor), largest), largest)
     held = [size for size in parents if float(law.exponent_of(size)) in HELD]
