@@ -22,7 +22,11 @@ from studies.sweep import netcdf
 DOCS = Path(__file__).parent
 BY_HAND = ("explore.png",)  # a screenshot of a browser
 LARGEST = 250_000  # bytes of a PNG that stays in all its colours
-PAGES = [DOCS / "tutorial.md", DOCS / "gallery.md", *sorted(DOCS.glob("howto_*.md"))]  # whose Python runs, from top to bottom
+PAGES = [
+    DOCS / "tutorial.md",
+    DOCS / "gallery.md",
+    *sorted(DOCS.glob("howto_*.md")),
+]  # whose Python runs, from top to bottom
 ARROW = "# ->"  # before each line that a statement prints
 
 # picture: (the study that draws it, the option --out of the study, relative to a folder)
