@@ -263,11 +263,8 @@ class Lattice:
         largest = self._scene.feed.largest_grain
 
         def swap(first):
-            last, numbers, hits = (
-                min(first + _SHARE, cells + 1),
-                np.empty(_SHARE // 2, np.uint64),
-                np.empty(_SHARE, bool),
-            )
+            last = min(first + _SHARE, cells + 1)
+            numbers, hits = np.empty((last - first + 1) // 2, np.uint64), np.empty(last - first, bool)
             work = numbers, numbers.view(np.int32), hits
             return kernels.swap(self.parcels, slots, edges, means, largest, key, first, last, *work)
 
