@@ -267,20 +267,23 @@ def left_out(found: Calibration, count: int = 1) -> Iterator[tuple[PilotTest, Ca
 
 def validated(found: Calibration) -> Calibration:
     """Return the calibration with the discrepancy that leaving out one test at a time tells."""
-    pairs = [(test, other.predict(test, intervals=False)) for test, other in left_out(found)]
+    pairs = [(test, other._replace(discrepancy={}).predict(test)) for test, other in left_out(found)]
     return found._replace(discrepancy=discrepancy(pairs))
 
 
 def discrepancy(
     pairs: Sequence[tuple[PilotTest, Prediction]], factor: float = 1.0, least: float = 0.0
 ) -> dict[str, float]:
-    """Return by quantity the standard deviation of measured tests about their predictions, as in `Calibration`."""
+    """Return by quantity the standard deviation of measured tests about their predictions, as in `Calibration`.
+
+    What the predictions' own intervals tell is taken off, at most three quarters of the variance.
+    """
     found = {}
     for name in (*PARTS, *FIGURES, "gap"):
         both = [_both(said, test, name) for test, said in pairs]
-        off, scale = (np.concatenate([one[k] for one in both]) for k in (0, 1))
-        if np.any(scale > 0):
-            found[name] = max(factor * math.sqrt(np.sum(off**2) / np.sum(scale**2)), least)
+        off, scale, known = (sum(np.sum(one[k] ** 2) for one in both) for k in range(3))
+        if scale > 0:
+            found[name] = max(factor * math.sqrt(max(off - known, off / 4) / scale), least)
     return found
 
 
@@ -484,12 +487,13 @@ def measured(test: PilotTest, name: str) -> np.ndarray:
     return np.atleast_1d(getattr(test, name))
 
 
-def _both(said: Prediction, test: PilotTest, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return predicted less measured where both are known, and what a discrepancy is a part of there."""
+def _both(said: Prediction, test: PilotTest, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return predicted less measured where both are known, what a discrepancy is a part of, and what intervals tell."""
     value, seen = getattr(said, name), measured(test, name)
     kept = np.isfinite(seen) & (value is not None)
     value = np.broadcast_to(np.nan if value is None else value, seen.shape)[kept]
-    return value - seen[kept], _scale(value, name)
+    reach = np.asarray(said.upper.get(name, 0.0)) - said.lower.get(name, 0.0)
+    return value - seen[kept], _scale(value, name), np.broadcast_to(reach / (2 * _LEVEL), seen.shape)[kept]
 
 
 def _at_test(scene: Scene, test: PilotTest, feed: Feed | None) -> Scene:
@@ -528,7 +532,7 @@ def _residuals(said: Prediction, test: PilotTest) -> dict[str, np.ndarray]:
     """Return by what each measured quantity is missed, percent passing or percent; of power beside the net power."""
     off = {}
     for name in (*PARTS, *_OF_MACHINE):
-        missed, _ = _both(said, test, name)
+        missed, *_ = _both(said, test, name)
         if missed.size:
             idle = test.idle_power if name == "power" and not math.isnan(test.idle_power) else 0.0
             off[name] = 100 * missed / (1.0 if name in PARTS else measured(test, name) - idle)

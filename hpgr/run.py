@@ -59,7 +59,7 @@ def run_scene(scene: Scene, seed: int = 0, replicate: int = 0, beds: Beds | None
     >>> from hpgr.run import run_scene
     >>> result = run_scene(hpgr.presets.industrial().with_values({"rolls.specific_pressing_force": "4 N/mm^2"}))
     >>> round(result.scene.rolls.gap, 4), round(float(result.values["specific_pressing_force"]))
-    (0.0538, 4000000)
+    (0.059, 4000000)
     """
     scene, bed = load(scene, beds)
     crushed = solve.crush(scene, bed, seed, replicate)

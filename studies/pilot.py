@@ -280,14 +280,13 @@ def _left_out(tests: Sequence[Any], fit: Callable[[list[Any]], Any], count: int)
         found += [(tests[k], fitted) for k in out or range(len(tests))]
     if not hasattr(fitted, "discrepancy"):
         return [(test, one.predict(test)) for test, one in found], len(fitted.constants)
-    pairs = [(test, one.predict(test, intervals=False)) for test, one in found]
-    if count == 1:
-        from hpgr.calibration import discrepancy
+    if count != 1:
+        return [(test, one.predict(test, intervals=False)) for test, one in found], len(fitted.estimates)
+    from hpgr.calibration import discrepancy
 
-        told = [discrepancy(pairs[:k] + pairs[k + 1 :]) for k in range(len(pairs))]
-        pairs = [
-            (test, one._replace(discrepancy=off).predict(test)) for (test, one), off in zip(found, told, strict=True)
-        ]
+    pairs = [(test, one._replace(discrepancy={}).predict(test)) for test, one in found]
+    told = [discrepancy(pairs[:k] + pairs[k + 1 :]) for k in range(len(pairs))]
+    pairs = [(test, one._replace(discrepancy=off).predict(test)) for (test, one), off in zip(found, told, strict=True)]
     return pairs, len(fitted.estimates)
 
 

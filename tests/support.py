@@ -45,6 +45,34 @@ def plain(function):
     return getattr(function, "py_func", function)
 
 
+# An ore between real rolls under the paper's laws, of which closed forms are known: no slip, nothing scatters
+_PAPERS_LAWS = {
+    "flow.nip_angle": "9.09 deg",
+    "flow.slip": 0.0,
+    "elasticity.bulk_modulus": 675384000.0,
+    "elasticity.shear_modulus": 312633583.03886926,
+    "elasticity.exponent": 0.5,
+    "elasticity.densification": 0.0,
+    "elasticity.recovery_modulus": None,
+    "strength.reference_strength": 1570986.6666666667,
+    "strength.weibull_modulus": 1.71,
+    "strength.scatter": math.inf,
+    "strength.cushioning": 0.586,
+    "fragments.exponent": 0.372,
+    "fragments.size_exponent": 0.0,
+}
+
+
+def plain_pilot():
+    """Return the pilot rolls of the preset under the paper's laws, with an idle torque."""
+    return presets.khd_pilot().with_values(_PAPERS_LAWS | {"rolls.entry_gap": 0.06, "rolls.idle_torque": 5330.0})
+
+
+def plain_industrial():
+    """Return the industrial rolls of the preset under the paper's laws."""
+    return presets.industrial().with_values(_PAPERS_LAWS | {"rolls.gap": 0.055, "rolls.entry_gap": 0.15})
+
+
 def paper(values=None):
     """Return the paper's scene in a small resolution, with other values by dotted name."""
     small = {"resolution.streamlines": 3, "resolution.points": 61, "resolution.cells": 64}

@@ -3,7 +3,7 @@ import io
 import numpy as np
 import pytest
 import xarray as xr
-from support import paper
+from support import paper, plain_industrial
 
 import hpgr
 from hpgr.run import run_scene
@@ -112,7 +112,7 @@ def test_same_seed_same_figures(measured):
 
 def test_a_machine_with_a_pressing_force_is_measured_at_the_gap_that_carries_it():
     """The gap given is 55 mm, at which the force would be 3.83 N/mm2."""
-    industrial = hpgr.presets.industrial().with_values({"resolution.cells": 64})
+    industrial = plain_industrial().with_values({"resolution.cells": 64})
     plan = TINY._replace(points=(41, 81, 161))
     forced = industrial.with_values({"rolls.specific_pressing_force": "4 N/mm^2"})
     result = accuracy.study(forced, plan)

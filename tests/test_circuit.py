@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from support import plain_industrial
 
 import hpgr
 from hpgr.results.schema import STATUS
@@ -15,7 +16,7 @@ FORCE = {"rolls.specific_pressing_force": "4 N/mm^2"}
 
 @pytest.fixture(scope="module")
 def scene():
-    return hpgr.presets.industrial().with_values(SMOOTH | FORCE)
+    return plain_industrial().with_values(SMOOTH | FORCE)
 
 
 def test_efficiency_of_the_screen():

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import cumulative_simpson, simpson
-from support import paper
+from support import paper, plain_industrial, plain_pilot
 
-from hpgr import Scene, operating_gap, presets, simulate
+from hpgr import Scene, operating_gap, simulate
 from hpgr.bed import machine
 from hpgr.bed.loaded import Beds, Pressed, bear, inputs_of, load_bed
 from hpgr.laws.flow import NipFlow, PowerFlow
@@ -20,11 +20,11 @@ SMALL = {"resolution.cells": 0, "resolution.points": 101, "resolution.streamline
 
 
 def pilot(values=None):
-    return presets.khd_pilot().with_values(SMALL | (values or {}))
+    return plain_pilot().with_values(SMALL | (values or {}))
 
 
 def industrial(values=None):
-    return presets.industrial().with_values(SMALL | (values or {}))
+    return plain_industrial().with_values(SMALL | (values or {}))
 
 
 def performance(scene):
@@ -319,7 +319,7 @@ def test_simulate_reports_the_operating_gap_and_keeps_it_in_the_scene():
 def test_bed_too_low_for_any_gap_is_refused_with_the_entry_gap_it_needs():
     steep = {"flow.nip_angle": "59 deg", "rolls.specific_pressing_force": 1e6}
     with pytest.raises(ValueError, match=r"rolls.entry_gap: got 60 mm; must be above .* begin the bed higher"):
-        machine.float_gap(presets.khd_pilot().with_values(steep))
+        machine.float_gap(plain_pilot().with_values(steep))
 
 
 def test_a_floated_gap_stays_below_the_steepest_entry():

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
+from support import plain_industrial
 
 import hpgr
 from studies.optimum import as_toml, main, optimise
@@ -16,7 +17,7 @@ FORCE, NIP = ("2 N/mm^2", "5 N/mm^2"), ("7 deg", "10 deg")
 
 
 def industrial(values):
-    return hpgr.presets.industrial().with_values(values)
+    return plain_industrial().with_values(values)
 
 
 def grid(scene, axes, limits, client, replicates):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from PIL import Image
-from support import paper, sized
+from support import paper, plain_industrial, plain_pilot, sized
 
 import hpgr
 from hpgr.bed.geometry import between_rolls
@@ -181,7 +181,7 @@ def test_assumptions_change_one_thing_each(scene):
     for other in others:
         assert len({key for key, part in dict(first).items() if dict(other)[key] != part} - {"resolution"}) == 1
     assert "n = inf" not in study.variants(scene.with_values({"strength.cushioning": "inf"}))
-    assert not any("speed exponent" in name for name in study.variants(hpgr.presets.industrial()))  # a nip has none
+    assert not any("speed exponent" in name for name in study.variants(plain_industrial()))  # a nip has none
 
 
 def test_assumed_figures_are_of_the_simulations(scene, monkeypatch):
@@ -200,7 +200,7 @@ def test_all_is_drawn_at_the_gap_that_carries_the_force():
     """The gap given is 55 mm, at which the force would be 3.83 N/mm2; fields, points and products are one machine's."""
     small = {"resolution.streamlines": 2, "resolution.points": 61, "resolution.cells": 40}
     forced = small | {"rolls.specific_pressing_force": "4 N/mm^2"}
-    scene = hpgr.presets.industrial().with_values(forced)
+    scene = plain_industrial().with_values(forced)
     result = study.study(scene, 20, assumptions=False)
     gap = hpgr.operating_gap(scene, "4 N/mm^2")
     assert gap == pytest.approx(0.0537, abs=2e-4)
@@ -260,7 +260,7 @@ def test_scenes_in_which_nothing_happens_are_drawn(tmp_path):
     """No pressure at all, hence no contour lines, no crushing, and one size everywhere in the animation."""
     small = {"resolution.streamlines": 1, "resolution.points": 11, "resolution.cells": 20}
     small |= {"flow.kind": "power", "flow.exponent": 2.0, "rolls.entry_gap": 0.163}
-    scene = hpgr.presets.khd_pilot().with_values(small)
+    scene = plain_pilot().with_values(small)
     result = study.study(scene, 6, assumptions=False)
     assert not result["pressure"].any()
     assert "the bed is not compacted" in study.findings(result)[0]

@@ -5,9 +5,9 @@ Where the model is known to disagree with measurements the test asserts what the
 
 import numpy as np
 import pytest
-from support import paper
+from support import paper, plain_industrial, plain_pilot
 
-from hpgr import Scene, presets, simulate
+from hpgr import Scene, simulate
 from hpgr.bed.loaded import inputs_of, load_bed
 from hpgr.results import metrics
 from studies.sweep import sweep
@@ -15,7 +15,7 @@ from studies.sweep import sweep
 SMALL = {"resolution.points": 101, "resolution.streamlines": 5, "resolution.cells": 60, "resolution.record": "product"}
 CLOSED = {"strength.cushioning": float("inf")}  # smooth in every axis: no cell is counted
 FORCES = [2.0e6, 2.8e6, 3.6e6, 4.4e6]
-REAL = {"khd_pilot": presets.khd_pilot, "industrial": presets.industrial}
+REAL = {"khd_pilot": plain_pilot, "industrial": plain_industrial}
 each_real = pytest.mark.parametrize("preset", REAL.values(), ids=REAL)
 
 
@@ -40,7 +40,7 @@ def throughput_of(scene):
 # --- throughput ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scene", [paper(), real(presets.khd_pilot), real(presets.industrial)],
+@pytest.mark.parametrize("scene", [paper(), real(plain_pilot), real(plain_industrial)],
                          ids=["paper", "khd_pilot", "industrial"])  # fmt: skip
 def test_throughput_and_power_are_linear_in_speed(scene):
     speeds = scene.rolls.speed * np.array([1.0, 2.0, 4.0])
@@ -111,7 +111,7 @@ def test_specific_energy_grows_nearly_in_proportion_to_force(pressed):
 
 def test_specific_energy_over_force_is_that_of_real_machines():
     """0.4 to 0.7 kWh/t per N/mm2 of the calibrated machine, idle torque included."""
-    result = sweep(real(presets.khd_pilot), {"rolls.specific_pressing_force": FORCES}, threads=1).isel(replicate=0)
+    result = sweep(real(plain_pilot), {"rolls.specific_pressing_force": FORCES}, threads=1).isel(replicate=0)
     ratio = result["specific_energy"] / 3600 / (result["specific_pressing_force"] / 1e6)
     assert np.all((ratio > 0.4) & (ratio < 0.7)), ratio.values
 
@@ -141,7 +141,7 @@ def test_coarser_feed_gives_a_slightly_finer_product_at_the_same_pressure():
     are, coarser than what is crushed. Stress knows nothing of grain size.
     """
     tops = [0.025, 0.035, 0.045]
-    result = sweep(real(presets.khd_pilot), {"feed.top_size": tops}, threads=1).isel(replicate=0)
+    result = sweep(real(plain_pilot), {"feed.top_size": tops}, threads=1).isel(replicate=0)
     p80 = result["p80_total"].values
     assert np.all(np.diff(p80) < 0)
     assert p80[-1] > 0.9 * p80[0]
@@ -149,7 +149,7 @@ def test_coarser_feed_gives_a_slightly_finer_product_at_the_same_pressure():
         assert np.all(result[name] == result[name][0])
     # of grains that all start above the critical size no more is left than gamma
     tops = [0.03, 0.04, 0.06]
-    alone = real(presets.khd_pilot, {"feed": {"kind": "single", "size": 0.03}})
+    alone = real(plain_pilot, {"feed": {"kind": "single", "size": 0.03}})
     result = sweep(alone, {"feed.size": tops}, threads=1).isel(replicate=0)
     assert result["p80_total"].values == pytest.approx(float(result["p80_total"][0]), rel=1e-6)
     assert np.all(np.diff(result["breaks_per_cell"].mean("streamline")) > 0)
@@ -162,7 +162,7 @@ def test_product_is_finer_in_the_middle_of_the_roll_width(preset):
 
 
 def test_softer_ore_is_crushed_finer_by_the_same_machine():
-    strengths = presets.khd_pilot().strength.reference_strength * np.array([0.5, 1.0, 2.0])
-    result = sweep(real(presets.khd_pilot), {"strength.reference_strength": strengths}, threads=1).isel(replicate=0)
+    strengths = plain_pilot().strength.reference_strength * np.array([0.5, 1.0, 2.0])
+    result = sweep(real(plain_pilot), {"strength.reference_strength": strengths}, threads=1).isel(replicate=0)
     assert np.all(np.diff(result["p80_total"]) > 0)
     assert np.all(result["power"] == result["power"][0])  # the model's bed does not know what breaks in it

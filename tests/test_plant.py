@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import xarray as xr
+from support import plain_industrial
 
 import studies.show.plant  # noqa: F401
-from hpgr import presets
 from studies.show.report import operating_points
 from studies.sweep import netcdf, sweep
 
@@ -13,7 +13,7 @@ from studies.sweep import netcdf, sweep
 @pytest.fixture(scope="module")
 def sweeps():
     small = {"resolution.streamlines": 2, "resolution.points": 40, "resolution.cells": 50}
-    base = presets.industrial().with_values(small)
+    base = plain_industrial().with_values(small)
     return [
         sweep(base, {name: values}, 2)
         for name, values in {"rolls.gap": ["50 mm", "55 mm"], "rolls.speed": ["10 rpm", "13 rpm"]}.items()

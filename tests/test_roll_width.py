@@ -3,9 +3,9 @@ import math
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from support import SIGMAS, sized
+from support import SIGMAS, plain_pilot, sized
 
-from hpgr import presets, simulate
+from hpgr import simulate
 from hpgr.laws.roll_width import WHOLE, FrictionHill, Parabola
 
 INF = math.inf
@@ -15,7 +15,7 @@ CLOSED = {"strength.cushioning": INF}
 
 def pilot(values=None, **fields):
     """The pilot rolls with a roll width of these fields."""
-    return presets.khd_pilot().with_values(PRODUCT | {"roll_width": fields} | (values or {}))
+    return plain_pilot().with_values(PRODUCT | {"roll_width": fields} | (values or {}))
 
 
 def test_slices_share_the_width():
@@ -72,7 +72,7 @@ def test_no_drop_is_the_scene_without_roll_width(cushioning):
     """Every slice then marches the same cells under the same stress: equal bits, but for rounding of shares."""
     small = {"strength.cushioning": cushioning, "resolution.cells": 200}
     sliced = simulate(pilot(small, pressure_drop=0.0, slices=2))
-    plain = simulate(presets.khd_pilot().with_values(PRODUCT | small))
+    plain = simulate(plain_pilot().with_values(PRODUCT | small))
     for row in sliced["passing_slice"].values:
         assert np.array_equal(row, plain["passing_total"])
     for name in ("passing_width_centre", "passing_width_edge", "passing_total", "passing"):
@@ -139,7 +139,7 @@ def test_sampling_of_slices_agrees_with_the_closed_form(feed):
 
 def test_stress_only_scenes_have_force_over_the_width_and_no_product():
     found = simulate(pilot({"resolution.cells": 0}, pressure_drop=0.9))
-    whole = simulate(presets.khd_pilot().with_values(PRODUCT | {"resolution.cells": 0}))
+    whole = simulate(plain_pilot().with_values(PRODUCT | {"resolution.cells": 0}))
     assert "passing_slice" not in found
     assert float(found["pressing_force"]) == pytest.approx(0.7 * float(whole["pressing_force"]), rel=1e-6)
     assert np.array_equal(found["pressure"], whole["pressure"])  # that of the middle of the width

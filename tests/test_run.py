@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from support import KS, first_cells, ks_distance, paper, sized
+from support import KS, first_cells, ks_distance, paper, plain_industrial, sized
 
 import hpgr
 from hpgr import Scene, cost, presets, simulate
@@ -271,7 +271,7 @@ MEANT = {
 
 @pytest.mark.parametrize("field", MEANT)
 def test_a_number_in_another_unit_is_flagged_before_all_else_with_the_unit_meant(field):
-    usual = presets.industrial().with_values({"resolution.cells": 0})
+    usual = plain_industrial().with_values({"resolution.cells": 0})
     assert not flags(simulate(usual))
     value, words = MEANT[field]
     said = simulate(usual.with_values({field: value})).attrs["diagnostics"]
@@ -295,7 +295,7 @@ def test_cushioning_too_weak_to_square_is_none():
 
 
 def test_feed_that_no_stress_breaks_is_flagged_with_its_share():
-    fine = presets.industrial().with_values({"feed.top_size": "8 mm", "strength.scatter": INF})
+    fine = plain_industrial().with_values({"feed.top_size": "8 mm", "strength.scatter": INF})
     ds = simulate(fine)
     assert "feed_below_critical" in flags(ds)
     share = re.search(r"feed_below_critical: ([\d.]+) of the feed is finer than ([\d.]+) mm", ds.attrs["diagnostics"])
@@ -460,7 +460,7 @@ def test_every_caller_runs_the_machine_whose_gap_carries_the_force():
     """55.0 mm and 3.83 N/mm2 are the machine as given; 53.7 mm carries 4.00."""
     from studies.sweep import sweep
 
-    scene = presets.industrial().with_values(HELD)
+    scene = plain_industrial().with_values(HELD)
     result = run_scene(scene)
     assert result.scene.rolls.gap == pytest.approx(53.78e-3, abs=1e-5)
     assert result.scene.rolls.gap == hpgr.operating_gap(scene, 4e6)
@@ -475,7 +475,7 @@ def test_every_caller_runs_the_machine_whose_gap_carries_the_force():
 
 
 def test_loading_a_floated_scene_again_changes_nothing():
-    scene, bed = load(presets.industrial().with_values(HELD))
+    scene, bed = load(plain_industrial().with_values(HELD))
     again, same = load(scene)
     assert again == scene
     assert np.array_equal(same.stress.pressure, bed.stress.pressure)

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support import paper
+from support import paper, plain_pilot
 
-from hpgr import presets
 from hpgr.bed import stress
 from hpgr.bed.kinematics import Kinematics, StepStrains
 from hpgr.bed.loaded import inputs_of, load_bed
@@ -285,7 +284,7 @@ def test_a_tiny_shear_limit_is_kept_to_the_last_bit():
 # The paper's machine; its flow and sand between pilot rolls; and the pilot's own flow below its nip, whose shear over
 # compaction is 2/3 (uniaxial), within the limit of its ore (1.39) but not of one five times as stiff in shear (0.62).
 PILOT_ROLLS = {"rolls.diameter": 0.8, "rolls.gap": 0.019, "rolls.entry_gap": 0.163, "feed.top_size": 0.045}
-PILOT = presets.khd_pilot()
+PILOT = plain_pilot()
 ON_SHEAR_LIMIT = {
     "paper": paper(),
     "pilot rolls": paper(PILOT_ROLLS | {"bed.feed_solid_fraction": 0.595}),

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support import paper
+from support import paper, plain_pilot
 
 import hpgr
 from hpgr.results import schema
@@ -320,7 +320,7 @@ def test_a_sweep_leaves_the_process_as_it_was(base, client, tmp_path, monkeypatc
 @pytest.mark.parametrize("tolerance", [None, 0.2])
 def test_gap_floats_under_a_swept_pressing_force(client, tolerance):
     small = {"resolution.points": 40, "resolution.streamlines": 2, "resolution.cells": 50}
-    scene = hpgr.presets.khd_pilot().with_values(small | {"resolution.record": "product"})
+    scene = plain_pilot().with_values(small | {"resolution.record": "product"})
     forces = [2.5e6, 3.5e6, 9e9]
     result = sweep(scene, {"rolls.specific_pressing_force": forces}, 2, client=client, tolerance=tolerance)
     assert result["status"].values.tolist() == [[0, 0], [0, 0], [1, 1]]
