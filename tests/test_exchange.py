@@ -115,7 +115,7 @@ def test_product_with_exchange_does_not_know_the_speed(record):
 
 def test_percolation_under_gravity_knows_the_speed():
     """Slow rolls segregate as under "shear", fast ones ever less: grains have no time to fall."""
-    base = mixed({"exchange.mixing": 0.0, "resolution.points": 31, "resolution.cells": 400})
+    base = mixed({"exchange.mixing": 0.0, "resolution.points": 31, "resolution.cells": sized(400, 60)})
     swaps = []
     for percolation, factor in (("shear", 1.0), ("gravity", 1e-4), ("gravity", 1.0), ("gravity", 100.0)):
         values = {"exchange.percolation": percolation, "rolls.speed": factor * base.rolls.speed}
