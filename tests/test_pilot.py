@@ -181,3 +181,16 @@ def test_laws_are_compared_by_leaving_out(written, capsys, monkeypatch):
     assert float(exponent.sel(laws="own")) == pytest.approx(float(exponent.sel(laws="measured")), abs=0.02)
     assert 0 < float(error.sel(laws="own", left_out=1, figure="width")) < 20
     assert "leave 2 out" in out
+
+
+def test_laws_under_which_no_gap_carries_a_test_are_told_and_have_no_errors(capsys, monkeypatch):
+    def refuse(*_):
+        raise ValueError("rolls.specific_pressing_force: got 3.5 MPa; no gap")
+
+    monkeypatch.setattr(pilot, "COMBINATIONS", [pilot.Laws("weak", {}, ("K",))])
+    monkeypatch.setattr(pilot._Refit, "__call__", refuse)
+    tests = tables.read_pilot_tests(PRODUCT, OPERATIONS)
+    scene = presets.khd_pilot().with_values({"roll_width": {"kind": "parabola"}, "resolution.record": "product"})
+    result = pilot.comparison(scene, tests, baselines=False)
+    assert "weak, 0 left out: rolls.specific_pressing_force: got 3.5 MPa" in capsys.readouterr().out
+    assert result["error"].sel(laws="weak").isnull().all()
