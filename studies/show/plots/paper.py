@@ -3,6 +3,7 @@
 Lines differ by dash and lightness, and fields carry contour lines, so that every figure can be read in black and white.
 """
 
+import textwrap
 from pathlib import Path
 
 import cmcrameri.cm as maps
@@ -297,4 +298,6 @@ def _caption(figure: Figure, result: xr.Dataset, words: str, limits: bool = Fals
     hit = [line.partition(": ")[2] for line in result.attrs["diagnostics"].splitlines()] if limits else []
     hit = [line[0].upper() + line[1:] + "." for line in hit]
     remark = [f"Scene: {scene.remark}."] if scene.remark else []
-    figure.supxlabel("\n".join(line for line in (about, words, *hit, *remark) if line), fontsize=8)
+    width = int(figure.get_figwidth() * 14)  # characters of this size on a line
+    folded = [textwrap.fill(line, width) for line in (about, words, *hit, *remark) if line]
+    figure.supxlabel("\n".join(folded), fontsize=8)
