@@ -221,9 +221,11 @@ def _machine_of(tests: Sequence[PilotTest], scene: Scene, opening: str) -> Machi
     diameter, width, solid = (
         own if math.isnan(told) else told
         for own, told in (
-            (rolls.diameter, first.diameter), (rolls.width, first.width), (bed.solid_density, first.solid_density),
+            (rolls.diameter, first.diameter),
+            (rolls.width, first.width),
+            (bed.solid_density, first.solid_density),
         )
-    )  # fmt: skip
+    )
     cakes = [test.throughput / (getattr(test, opening) * width * test.surface_speed) for test in tests]
     known = [cake for cake in cakes if math.isfinite(cake)]
     cake = sum(known) / len(known) if known else 0.85 * solid

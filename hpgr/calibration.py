@@ -346,8 +346,9 @@ class _Problem:
     def start(self) -> np.ndarray:
         """Return the place to start from: beds that carry the tests' forces near their gaps."""
         started = {group: _started(self.scene, self.names, self.tests[group], self.feed) for group in set(self.groups)}
-        return np.array([PARAMETERS[name].scaled(_field(started[group], PARAMETERS[name].field))
-                         for name, group in self.columns])  # fmt: skip
+        return np.array(
+            [PARAMETERS[name].scaled(_field(started[group], PARAMETERS[name].field)) for name, group in self.columns]
+        )
 
     def from_estimates(self, near: Calibration, start: np.ndarray) -> np.ndarray:
         """Return the place that has what another calibration has found."""
@@ -423,8 +424,12 @@ class _Problem:
             lambda part: np.append(self.residuals(at(part)), (part - start[free]) / spreads),
             np.clip(place[free], low, high),
             lambda part: np.vstack([self.slopes(at(part))[:, free], np.diag(1 / spreads)]),
-            bounds=(low, high), x_scale=spreads, xtol=1e-4, ftol=1e-4, max_nfev=40,
-        )  # fmt: skip
+            bounds=(low, high),
+            x_scale=spreads,
+            xtol=1e-4,
+            ftol=1e-4,
+            max_nfev=40,
+        )
         return at(found.x)
 
     def covariance(self, place: np.ndarray, slopes: np.ndarray, free: list[int]) -> np.ndarray:
@@ -509,15 +514,18 @@ def _at_test(scene: Scene, test: PilotTest, feed: Feed | None) -> Scene:
         "bed.solid_density": test.solid_density,
         "rolls.idle_torque": test.idle_power / speed,
     }
-    return scene.with_values({name: value for name, value in told.items() if not math.isnan(value)} | {
-        "rolls.diameter": diameter,
-        "rolls.entry_gap": rolls.entry_gap * diameter / rolls.diameter,
-        "rolls.speed": speed,
-        "rolls.specific_pressing_force": test.specific_pressing_force,
-        "feed": feed or TableFeed(table=table),
-        "resolution.sieves": tuple(test.sizes.tolist()),
-        "flow": scene.flow.held(rolls.gap, rolls.diameter, scene.bed.feed_solid_fraction),
-    })  # fmt: skip
+    return scene.with_values(
+        {name: value for name, value in told.items() if not math.isnan(value)}
+        | {
+            "rolls.diameter": diameter,
+            "rolls.entry_gap": rolls.entry_gap * diameter / rolls.diameter,
+            "rolls.speed": speed,
+            "rolls.specific_pressing_force": test.specific_pressing_force,
+            "feed": feed or TableFeed(table=table),
+            "resolution.sieves": tuple(test.sizes.tolist()),
+            "flow": scene.flow.held(rolls.gap, rolls.diameter, scene.bed.feed_solid_fraction),
+        }
+    )
 
 
 def _predict(scene: Scene, beds: Beds | None = None) -> Prediction:

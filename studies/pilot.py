@@ -95,8 +95,11 @@ _POWER_LAW = {"elasticity.densification": 0.0, "elasticity.exponent": 0.5}
 _PARABOLA, _THRESHOLD = {"roll_width": {"kind": "parabola"}}, {"strength.scatter": math.inf}
 COMBINATIONS = (
     Laws("paper's laws", _NO_SLIP | _NO_RECOVERY | _POWER_LAW | _PARABOLA | _THRESHOLD, (*_ORE, "kappa", *_MACHINE)),
-    Laws("the same, idle torque fitted", _NO_SLIP | _NO_RECOVERY | _POWER_LAW | _PARABOLA | _THRESHOLD,
-         (*_ORE, "kappa", *_MACHINE, "T_0")),
+    Laws(
+        "the same, idle torque fitted",
+        _NO_SLIP | _NO_RECOVERY | _POWER_LAW | _PARABOLA | _THRESHOLD,
+        (*_ORE, "kappa", *_MACHINE, "T_0"),
+    ),
     Laws("bed: slip", _NO_RECOVERY | _POWER_LAW | _PARABOLA | _THRESHOLD, (*_ORE, "kappa", *_MACHINE)),
     Laws("bed: slip, densification", _NO_RECOVERY | _PARABOLA | _THRESHOLD, (*_ORE, "kappa", *_MACHINE)),
     Laws("bed: slip, densification, recovery", _PARABOLA | _THRESHOLD, (*_ORE, "kappa", *_MACHINE)),
@@ -105,7 +108,7 @@ COMBINATIONS = (
     Laws("bed + hill + scatter", {}, (*_ORE, "k", "epsilon", *_MACHINE)),
     Laws("bed + parabola + scatter + parent", _PARABOLA, (*_ORE, "k", "nu", "kappa", *_MACHINE)),
     Laws("bed + hill + scatter + parent", {}, (*_ORE, "k", "nu", "epsilon", *_MACHINE)),
-)  # fmt: skip
+)
 
 
 @command("pilot", __doc__)
@@ -251,8 +254,13 @@ def comparison(scene: Scene, tests: Sequence[Any], baselines: bool) -> "xr.Datas
         "left_out": own(("left_out",), "1", "tests left out at a time; 0: errors of the fit", dtype=np.int32),
         "figure": own(("figure",), "", "figure of merit", dtype=object),
     }
-    data = {"error": values, "constants": constants, "laws": names, "left_out": range(3),
-            "figure": np.array(list(_ERRORS), object)}  # fmt: skip
+    data = {
+        "error": values,
+        "constants": constants,
+        "laws": names,
+        "left_out": range(3),
+        "figure": np.array(list(_ERRORS), object),
+    }
     attrs = schema.dataset_attributes("Combinations of laws against pilot tests", scene=scene.model_dump_json())
     return schema.to_dataset(data, attrs, table)
 
@@ -356,8 +364,21 @@ def compared(result: "xr.Dataset") -> str:
                 row.append(f"{_figure(at['coverage'], '.0f')}, {_figure(at['width'], '.1f')}")
         row += [_figure(one.sel(left_out=0, figure=key).item(), ".2f") for key in ("gap_exponent", "energy_exponent")]
         rows.append(row)
-    headings = ["laws", "n", "fit", "leave 1 out", "centre", "edge", "Q [%]", "P [%]", "W [%]", "inside, width [%]",
-                "leave 2 out", "gap exp.", "W exp."]  # fmt: skip
+    headings = [
+        "laws",
+        "n",
+        "fit",
+        "leave 1 out",
+        "centre",
+        "edge",
+        "Q [%]",
+        "P [%]",
+        "W [%]",
+        "inside, width [%]",
+        "leave 2 out",
+        "gap exp.",
+        "W exp.",
+    ]
     return aligned(headings, rows, words=1)
 
 
@@ -424,15 +445,26 @@ def _own(samples: dict[str, np.ndarray]) -> dict[str, Any]:
         for name, one in figures.items()
         for side in ("lower", "upper")
     }
-    return figures | ends | {
-        "blind": Variable(("test",), "1", "whether the test was left out of the fit", dtype=np.int8),
-        "failure": Variable(dims, "", "why a model predicts nothing of a test", dtype=object),
-        "source": Variable(("source",), "", "measurement or model", dtype=object),
-        "test": Variable(("test",), "", "pilot test", dtype=object),
-        "part": Variable(("part",), "", "part of the roll width", dtype=object),
-        **{name: Variable(("sample",), field_info(name).unit, f"{field_info(name).symbol}, drawn with its covariance",
-                          dtype=np.float64) for name in samples},
-    }  # fmt: skip
+    return (
+        figures
+        | ends
+        | {
+            "blind": Variable(("test",), "1", "whether the test was left out of the fit", dtype=np.int8),
+            "failure": Variable(dims, "", "why a model predicts nothing of a test", dtype=object),
+            "source": Variable(("source",), "", "measurement or model", dtype=object),
+            "test": Variable(("test",), "", "pilot test", dtype=object),
+            "part": Variable(("part",), "", "part of the roll width", dtype=object),
+            **{
+                name: Variable(
+                    ("sample",),
+                    field_info(name).unit,
+                    f"{field_info(name).symbol}, drawn with its covariance",
+                    dtype=np.float64,
+                )
+                for name in samples
+            },
+        }
+    )
 
 
 def _predicted(model: Model, test: Any) -> dict[str, Any]:

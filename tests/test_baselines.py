@@ -35,17 +35,31 @@ def made_up(name="A", speed=0.7, force=3e6, **measured):
     """Return a test without any measured product."""
     nothing = np.full(len(SIZES), math.nan)
     values = {
-        "gap": 0.018, "cake_thickness": 0.022, "throughput": math.nan, "specific_throughput": math.nan,
-        "power": math.nan, "specific_energy": math.nan, "hydraulic_pressure": 2 * force, "moisture": math.nan,
-        "diameter": math.nan, "width": math.nan, "solid_density": math.nan, "idle_power": math.nan,
+        "gap": 0.018,
+        "cake_thickness": 0.022,
+        "throughput": math.nan,
+        "specific_throughput": math.nan,
+        "power": math.nan,
+        "specific_energy": math.nan,
+        "hydraulic_pressure": 2 * force,
+        "moisture": math.nan,
+        "diameter": math.nan,
+        "width": math.nan,
+        "solid_density": math.nan,
+        "idle_power": math.nan,
         "cake_density": math.nan,
-        "sizes": SIZES, "feed": FEED, "centre": nothing, "edge": nothing, "total": nothing,
-    }  # fmt: skip
+        "sizes": SIZES,
+        "feed": FEED,
+        "centre": nothing,
+        "edge": nothing,
+        "total": nothing,
+    }
     return tables.PilotTest(name, speed, force, **(values | measured))
 
 
-def torres_casali(parameters=PLANTED, machine=KHD, reference=0.03, blocks=10, opening="cake_thickness",
-                  force="hydraulic_pressure"):  # fmt: skip
+def torres_casali(
+    parameters=PLANTED, machine=KHD, reference=0.03, blocks=10, opening="cake_thickness", force="hydraulic_pressure"
+):
     return Fit(TorresCasaliModel(machine, reference, opening, force, blocks), parameters, math.nan, ())
 
 
@@ -224,9 +238,13 @@ def test_predictions_are_distributions_with_the_centre_finest(pilot):
         assert (found.centre - found.edge >= -1e-12).all()
         assert found.specific_energy == pytest.approx(found.power / found.throughput)
         assert found.power == pytest.approx(
-            2 * test.specific_pressing_force * 0.8 * 0.25 * test.surface_speed
+            2
+            * test.specific_pressing_force
+            * 0.8
+            * 0.25
+            * test.surface_speed
             * math.sin(baselines.nip_angle(KHD, test.cake_thickness) / 2)
-        )  # fmt: skip
+        )
 
 
 # ---------------------------------------------------------------------------- Hinde & Kalala
@@ -280,8 +298,10 @@ def test_edge_and_centre_share_the_energy():
 def rmse(prediction, test):
     """Root mean square error, percent passing, of centre, edge and total; NaN where not measured."""
     errors = {name: 100 * (getattr(prediction, name) - getattr(test, name)) for name in baselines.PRODUCTS}
-    return {name: float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else math.nan
-            for name, error in errors.items()}  # fmt: skip
+    return {
+        name: float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else math.nan
+        for name, error in errors.items()
+    }
 
 
 def test_torres_casali_recovers_planted_parameters(scene):
@@ -356,9 +376,15 @@ def test_blind_predictions_of_the_pilot_tests(pilot, scene):
 def test_predictions_look_at_nothing_that_was_measured_of_the_outcome(pilot):
     nothing = np.full(13, math.nan)
     bare = pilot[4]._replace(
-        centre=nothing, edge=nothing, total=nothing, power=math.nan, throughput=math.nan,
-        specific_throughput=math.nan, specific_energy=math.nan, gap=math.nan,
-    )  # fmt: skip
+        centre=nothing,
+        edge=nothing,
+        total=nothing,
+        power=math.nan,
+        throughput=math.nan,
+        specific_throughput=math.nan,
+        specific_energy=math.nan,
+        gap=math.nan,
+    )
     for fit in (torres_casali(reference=0.04, blocks=3), hinde_kalala(HINDE, 0.045)):
         for one, two in zip(fit.predict(bare), fit.predict(pilot[4]), strict=True):
             assert one == pytest.approx(two, nan_ok=True)

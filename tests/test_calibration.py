@@ -12,8 +12,13 @@ from studies.pilot import START
 
 PSD, OPERATIONS = presets.DATA / "khd_porphyry_psd.csv", presets.DATA / "khd_porphyry_operations.csv"
 # n = inf is the closed form: quick, exact, and smooth in every parameter
-SMALL = START | {"resolution.points": 21, "resolution.streamlines": 1, "resolution.record": "product",
-                 "elasticity.bulk_modulus": 42e6, "elasticity.shear_modulus": 19.5e6}  # fmt: skip
+SMALL = START | {
+    "resolution.points": 21,
+    "resolution.streamlines": 1,
+    "resolution.record": "product",
+    "elasticity.bulk_modulus": 42e6,
+    "elasticity.shear_modulus": 19.5e6,
+}
 WIDE = {"roll_width": {"kind": "friction_hill", "edge_ratio": 0.1, "slices": 1}}
 PLANTED = {"sigma_m": 3.1e6, "w": 2.0, "k": 0.8, "gamma": 0.45, "nu": 0.5, "K": 50e6, "epsilon": 0.15, "T_0": 2e3}
 
@@ -48,13 +53,17 @@ def measured(scene, test, noise=0.0, seed=0):
 
     apart = {name: off(getattr(found, name)) for name in ("centre", "edge", "total")}
     return test._replace(
-        **apart, throughput=float(off(found.throughput, True)), power=float(off(found.power, True)),
-        cake_thickness=float(off(found.gap, True)), specific_energy=math.nan,
-    )  # fmt: skip
+        **apart,
+        throughput=float(off(found.throughput, True)),
+        power=float(off(found.power, True)),
+        cake_thickness=float(off(found.gap, True)),
+        specific_energy=math.nan,
+    )
 
 
-@pytest.mark.parametrize("names", [["K", "T_0"], ["sigma_m", "k", "gamma"], ["epsilon", "K", "nu", "gamma"]],
-                         ids=["machine", "ore", "both"])  # fmt: skip
+@pytest.mark.parametrize(
+    "names", [["K", "T_0"], ["sigma_m", "k", "gamma"], ["epsilon", "K", "nu", "gamma"]], ids=["machine", "ore", "both"]
+)
 def test_planted_parameters_are_recovered(pilot_tests, names):
     scene = planted(names)
     tests = [measured(scene, pilot_tests[name]) for name in ("K-P1", "K-P3")]
@@ -89,10 +98,13 @@ def test_constants_of_machine_and_feed_are_each_groups_own_and_idle_power_is_tak
     """Other rolls under another bed: their K is found beside the pilot's, one gamma for both."""
     first = pilot_tests["K-P1"]
     other = first._replace(name="B1", diameter=1.0, width=0.4, solid_density=2900.0, idle_power=5e3)
-    made = [measured(planted(["gamma"]).with_values(values), test) for values, test in (
-        ({}, first),
-        ({"elasticity.bulk_modulus": 80e6, "elasticity.shear_modulus": 37e6}, other),
-    )]  # fmt: skip
+    made = [
+        measured(planted(["gamma"]).with_values(values), test)
+        for values, test in (
+            ({}, first),
+            ({"elasticity.bulk_modulus": 80e6, "elasticity.shear_modulus": 37e6}, other),
+        )
+    ]
     found = fit_tests(start(), made, ["gamma", "K"])
     assert list(found.estimates) == ["gamma", "K", "K of B1"]
     ratio = found.estimates["K of B1"].value / found.estimates["K"].value
@@ -108,9 +120,14 @@ def test_what_tests_do_not_tell_is_left_at_its_start_and_named(pilot_tests):
     """The total product alone: nothing of throughput, power and gap tells of K and alpha."""
     bare = np.full(13, math.nan)
     test = pilot_tests["K-P1"]._replace(
-        centre=bare, edge=bare, throughput=math.nan, power=math.nan, gap=math.nan, cake_thickness=math.nan,
+        centre=bare,
+        edge=bare,
+        throughput=math.nan,
+        power=math.nan,
+        gap=math.nan,
+        cake_thickness=math.nan,
         specific_energy=math.nan,
-    )  # fmt: skip
+    )
     scene = start()
     found = fit_tests(scene, [test], ["gamma", "sigma_m", "alpha", "K"])
     assert "alpha" in found.undetermined

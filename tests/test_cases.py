@@ -55,9 +55,14 @@ def test_address_tells_fields_apart_and_is_that_of_the_final_scene():
 def test_address_tells_seed_replicate_tolerance_and_code_apart():
     base = paper()
     found = [
-        address(base), address(base, replicate=1), address(base, seed=1), address(base, tolerance=0.01),
-        address(base, tolerance=0.02), address(base, tolerance=0.01, max_cost=30.0), address(base, code="other"),
-    ]  # fmt: skip
+        address(base),
+        address(base, replicate=1),
+        address(base, seed=1),
+        address(base, tolerance=0.01),
+        address(base, tolerance=0.02),
+        address(base, tolerance=0.01, max_cost=30.0),
+        address(base, code="other"),
+    ]
     assert len(set(found)) == len(found)
     assert address(base) == address(base, max_cost=30.0)  # which decides nothing without a tolerance
     assert address(base) == address(base, timeout=3.0)
@@ -70,9 +75,12 @@ def test_address_is_the_same_in_another_process():
     script += "print(Addresses(SweepSpec(paper())).of({'rolls.gap': 0.05}, 1))"
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     done = subprocess.run(
-        [sys.executable, "-c", script], env=os.environ | {"PYTHONPATH": path, "PYTHONHASHSEED": "7"},
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        [sys.executable, "-c", script],
+        env=os.environ | {"PYTHONPATH": path, "PYTHONHASHSEED": "7"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert done.stdout.strip() == address(paper(), {"rolls.gap": 0.05}, 1)
 
 

@@ -126,8 +126,13 @@ def test_points_are_one_time_step_apart(values):
     for line, xi in enumerate(bed.xi):
         for upper, lower in zip(motion.y[line, :-1], motion.y[line, 1:], strict=True):
             kink = [nip] if lower < nip < upper else None
-            time = quad(lambda y, xi=xi: -1 / velocity(scene, bed, xi * bed.outer(y), y)[1], lower, upper,
-                        epsrel=1e-11, points=kink)[0]  # fmt: skip
+            time = quad(
+                lambda y, xi=xi: -1 / velocity(scene, bed, xi * bed.outer(y), y)[1],
+                lower,
+                upper,
+                epsrel=1e-11,
+                points=kink,
+            )[0]
             assert time == pytest.approx(motion.time_step, rel=1e-7)
 
 

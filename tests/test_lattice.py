@@ -363,8 +363,9 @@ def test_start_up_begins_with_the_feed_where_nothing_crushes():
     assert np.isneginf(log_stress).sum() >= 9
     swapped = simulate(scene.with_values(STRONG), seed=18)["size"].values[0]
     assert not np.array_equal(swapped, first)
-    assert np.array_equal(np.sort(swapped.reshape(-1, first.shape[-1]), axis=0),
-                          np.sort(first.reshape(-1, first.shape[-1]), axis=0))  # fmt: skip
+    assert np.array_equal(
+        np.sort(swapped.reshape(-1, first.shape[-1]), axis=0), np.sort(first.reshape(-1, first.shape[-1]), axis=0)
+    )
 
 
 def test_product_becomes_finer_through_the_start_up():

@@ -85,8 +85,9 @@ def tube(scene, xi, heights=4001):
     return y, turned[:, 0, 0], simpson(work * 2 * nip * fraction, x=fraction), (p, q, eps_v, eps_s)
 
 
-@pytest.mark.parametrize("scene", [pilot(), industrial(), pilot({"elasticity.exponent": 1.0})],
-                         ids=["pilot", "industrial", "c = 1"])  # fmt: skip
+@pytest.mark.parametrize(
+    "scene", [pilot(), industrial(), pilot({"elasticity.exponent": 1.0})], ids=["pilot", "industrial", "c = 1"]
+)
 def test_force_is_the_normal_stress_on_the_roll(scene):
     y, normal, _, _ = tube(scene, 1.0)
     exact = -np.trapezoid(normal, y)
@@ -138,8 +139,11 @@ def test_power_is_that_of_plates_closing_on_the_bed():
 # --- identities ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scene", [pilot(), industrial(), paper(), pilot({"roll_width": {}})],
-                         ids=["pilot", "industrial", "paper", "roll width"])  # fmt: skip
+@pytest.mark.parametrize(
+    "scene",
+    [pilot(), industrial(), paper(), pilot({"roll_width": {}})],
+    ids=["pilot", "industrial", "paper", "roll width"],
+)
 def test_identities_of_force_torque_power_and_energy(scene):
     """W = 2000 Fsp sin(beta) / mdot, with W in kWh/t, Fsp in N/mm2, mdot in t s/(h m3)."""
     bare = performance(scene.with_values({"rolls.idle_torque": 0.0}))
@@ -253,8 +257,12 @@ def same(one, other):
 
 # --- floating gap -------------------------------------------------------------------------------------------
 
-FLOATING = {"pilot": pilot(), "industrial": industrial(), "paper": paper({"resolution.cells": 0}),
-            "roll width": pilot({"roll_width": {}})}  # fmt: skip
+FLOATING = {
+    "pilot": pilot(),
+    "industrial": industrial(),
+    "paper": paper({"resolution.cells": 0}),
+    "roll width": pilot({"roll_width": {}}),
+}
 floating = pytest.mark.parametrize("scene", FLOATING.values(), ids=FLOATING)
 
 

@@ -40,8 +40,9 @@ def throughput_of(scene):
 # --- throughput ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scene", [paper(), real(plain_pilot), real(plain_industrial)],
-                         ids=["paper", "khd_pilot", "industrial"])  # fmt: skip
+@pytest.mark.parametrize(
+    "scene", [paper(), real(plain_pilot), real(plain_industrial)], ids=["paper", "khd_pilot", "industrial"]
+)
 def test_throughput_and_power_are_linear_in_speed(scene):
     speeds = scene.rolls.speed * np.array([1.0, 2.0, 4.0])
     result = sweep(scene, {"rolls.speed": speeds}, threads=1).isel(replicate=0)

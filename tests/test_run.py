@@ -545,8 +545,12 @@ def test_no_field_of_a_scene_is_forgotten():
             if any(not np.array_equal(first.values.get(k), found.values.get(k)) for k in first.values | found.values):
                 mattered.add(name)
     assert seen - mattered == MAY_NOT_MATTER | {name for name in seen if name.endswith(".kind")}
-    fields = {f"{section}.{key}" for section, field in Scene.model_fields.items() for part in parts_of(field)
-              for key in part.model_fields}  # fmt: skip
+    fields = {
+        f"{section}.{key}"
+        for section, field in Scene.model_fields.items()
+        for part in parts_of(field)
+        for key in part.model_fields
+    }
     assert seen == fields | {"remark"}
 
 
