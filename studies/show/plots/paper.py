@@ -3,7 +3,6 @@
 Lines differ by dash and lightness, and fields carry contour lines, so that every figure can be read in black and white.
 """
 
-import textwrap
 from pathlib import Path
 
 import cmcrameri.cm as maps
@@ -19,6 +18,7 @@ from PIL import Image
 
 from hpgr.fields import show
 from hpgr.scene import Scene
+from studies.show.plots.sweeps import folded
 
 _POSITIONS = 5  # of the stream tubes, at most, whose product is drawn
 _DASHES = ("-", (0, (6, 1.5)), (0, (3, 1.2)), (0, (4, 1, 1, 1)), (0, (1, 1)))
@@ -298,6 +298,4 @@ def _caption(figure: Figure, result: xr.Dataset, words: str, limits: bool = Fals
     hit = [line.partition(": ")[2] for line in result.attrs["diagnostics"].splitlines()] if limits else []
     hit = [line[0].upper() + line[1:] + "." for line in hit]
     remark = [f"Scene: {scene.remark}."] if scene.remark else []
-    width = int(figure.get_figwidth() * 14)  # characters of this size on a line
-    folded = [textwrap.fill(line, width) for line in (about, words, *hit, *remark) if line]
-    figure.supxlabel("\n".join(folded), fontsize=8)
+    figure.supxlabel(folded(figure, [line for line in (about, words, *hit, *remark) if line]), fontsize=8)

@@ -77,9 +77,13 @@ def caption_under(figure: Figure, result: xr.Dataset, words: str) -> None:
     lines = [words, *(line[0].upper() + line[1:] + "." for line in report.flag_line(result))]
     remark = scene_of(result).remark
     lines += [f"Scene: {remark}."] if remark else []
+    figure.supxlabel(folded(figure, lines), fontsize=9)
+
+
+def folded(figure: Figure, lines: list[str]) -> str:
+    """Return the lines of a caption, each folded to the width of the figure."""
     width = int(14 * figure.get_figwidth())  # letters
-    folded = [textwrap.fill(line, width) for line in "\n".join(lines).splitlines()]
-    figure.supxlabel("\n".join(folded), fontsize=9)
+    return "\n".join(textwrap.fill(line, width) for line in "\n".join(lines).splitlines())
 
 
 def _products(panels, result: xr.Dataset, sieve: float) -> bool:
