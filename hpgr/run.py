@@ -69,7 +69,8 @@ def run_scene(scene: Scene, seed: int = 0, replicate: int = 0, beds: Beds | None
     values = _fields(bed) | _summaries(scene, bed) | performance._asdict() | {"throughput": throughput}
     values |= _product(scene, crushed) | {"flags": sum(flags.BITS[name] for name in found)}
     diagnostics = "\n".join(f"{name}: {words}" for name, words in found.items())
-    return Result(scene, bed, values, diagnostics, solve.choose(scene))
+    solver = solve.choose(scene) + ", control variate" * solve.is_controlled(scene)
+    return Result(scene, bed, values, diagnostics, solver)
 
 
 def simulate(

@@ -196,6 +196,10 @@ class Resolution(Frozen):
     """What is kept: 'cells' (every size), 'distributions' (mass per sieve at every point), 'product' (size distribution
     at the exit).
     """
+    control_variate: bool = True
+    """Whether a product that cells sample is corrected by what the same cells come to without cushioning, which is
+    known exactly; only where the product alone is recorded, as recorded cells count for themselves.
+    """
     sieves: tuple[Metres, ...] = quantity(
         _default_sieves(),
         symbol="s_k",

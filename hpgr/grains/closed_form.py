@@ -24,19 +24,20 @@ _CLASSES = 30  # per factor e in size; passing is then right to 1e-4
 _BELOW_FLOOR = 0.05  # the finest class of the cascade over the size floor
 
 
-def crushed(feed: Feed, strength: Strength, fragments: Fragments, critical: np.ndarray) -> tuple[Callable, np.ndarray]:
-    """Return the product of complete crushing: its passing as a function of size, m, and its mean breaks per grain.
+def crushed(feed: Feed, strength: Strength, fragments: Fragments, critical: np.ndarray) -> tuple[Callable, Callable]:
+    """Return the product of complete crushing: its passing as a function of size, m, and what gives breaks per grain.
 
     `critical` is any array of critical sizes, m, held at the size floor or above; sizes are broadcast against it.
     """
     if math.isinf(strength.scatter) and fragments.size_exponent == 0:
         passing = partial(crushed_passing, feed, critical=critical, gamma=fragments.exponent)
-        return passing, expected_breaks(feed, critical, fragments.exponent)
+        return passing, partial(expected_breaks, feed, critical, fragments.exponent)
     edges, cumulative, breaks = _cascade(feed, strength, fragments, critical.ravel())
+    breaks = breaks.reshape(critical.shape)
     if not breaks.any():  # the feed itself, not its classes
         critical = np.full(critical.shape, np.inf)
-        return partial(crushed_passing, feed, critical=critical, gamma=fragments.exponent), np.zeros(critical.shape)
-    return partial(_between, edges, cumulative.reshape(-1, *critical.shape)), breaks.reshape(critical.shape)
+        return partial(crushed_passing, feed, critical=critical, gamma=fragments.exponent), lambda: breaks
+    return partial(_between, edges, cumulative.reshape(-1, *critical.shape)), lambda: breaks
 
 
 def _cascade(feed: Feed, strength: Strength, fragments: Fragments, critical: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -1,6 +1,7 @@
 """Picks the cheapest solver the scene allows, runs it, and sums up the product (docs/model.md, Solvers)."""
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from hpgr.laws.roll_width import WHOLE, Slices
 from hpgr.scene import Scene
 
 _AT_ONCE = 4000  # points whose closed form is taken at once: each takes up to 20 kB
+_ROUNDED = 1 + 1.2e-7  # covers the rounding of a size to float32
 FRACTIONS = (0.5, 0.8)  # of the percentiles every product is summarised by
 
 
@@ -87,6 +89,13 @@ def choose(scene: Scene) -> str:
     return "march"
 
 
+def is_controlled(scene: Scene) -> bool:
+    """Return whether the product of the march is corrected by the closed form (docs/model.md, Solvers)."""
+    strength, grid = scene.strength, scene.resolution
+    known = math.isfinite(strength.cushioning) and math.isfinite(strength.weibull_modulus)
+    return known and grid.control_variate and grid.record == "product" and choose(scene) == "march"
+
+
 def crushing_stress(scene: Scene, bed: LoadedBed) -> np.ndarray:
     """Return the stress that crushes, (streamline, point), Pa: 0 where the bed does not compact (paper eq. 1)."""
     stress = scene.strength.crushing_stress(bed.stress.pressure, bed.stress.shear_stress)
@@ -115,19 +124,24 @@ def crush(scene: Scene, bed: LoadedBed, seed: int, replicate: int) -> Crushed | 
     if solver in ("lattice", "reduced lattice"):
         cells, exchanged = lattice.run(scene, log_stress, bed, seed, replicate, reduced=solver != "lattice")
         return _summarised(scene, cells, slices)._replace(exchanged=exchanged)
-    return _summarised(scene, march.march(scene, log_stress, slices, seed, replicate), slices)
+    if not is_controlled(scene):
+        return _summarised(scene, march.march(scene, log_stress, slices, seed, replicate), slices)
+    cells = march.march(scene, log_stress, slices, seed, replicate, complete=True)
+    return _summarised(scene, cells, slices, _complete(scene, log_stress.max(axis=1), slices)[0])
+
+
+def _complete(scene: Scene, highest: np.ndarray, slices: Slices) -> tuple[Callable, Callable]:
+    """Return what is known of crushing without cushioning at the highest stress of each slice and streamline."""
+    critical = scene.strength.critical_size(highest + np.log(slices.pressure).reshape(-1, *(1,) * highest.ndim))
+    critical = np.maximum(critical, scene.fragments.size_floor)
+    return closed_form.crushed(scene.feed, scene.strength, scene.fragments, critical)
 
 
 def _closed_form(scene: Scene, log_stress: np.ndarray, slices: Slices) -> Crushed:
     feed, grid = scene.feed, scene.resolution
     highest = np.maximum.accumulate(log_stress, axis=1)
-
-    def crushed(level):
-        critical = np.maximum(scene.strength.critical_size(level), scene.fragments.size_floor)
-        return closed_form.crushed(feed, scene.strength, scene.fragments, critical)
-
     # (slice, streamline): a stream tube of each slice leaves with the product of its own critical size
-    at_exit, breaks = crushed(highest[:, -1] + np.log(slices.pressure)[:, None])
+    at_exit, breaks = _complete(scene, highest[:, -1], slices)
     sieves, tubes = np.array(grid.sieves), log_stress.shape[0]
 
     def passing(size, share=slices.share):  # size (..., streamline)
@@ -140,10 +154,10 @@ def _closed_form(scene: Scene, log_stress: np.ndarray, slices: Slices) -> Crushe
     mass = None
     if grid.record == "distributions":
         parts = np.array_split(highest, -(-highest.size // _AT_ONCE), axis=1)
-        everywhere = np.concatenate([crushed(part)[0](size=sieves[:, None, None]) for part in parts], axis=-1)
-        mass = np.diff(np.moveaxis(everywhere, 0, -1), axis=-1, prepend=0.0)[None]
+        points = [_complete(scene, part, WHOLE)[0](size=sieves[:, None, None, None])[:, 0] for part in parts]
+        mass = np.diff(np.moveaxis(np.concatenate(points, axis=-1), 0, -1), axis=-1, prepend=0.0)[None]
     return Crushed(
-        breaks=slices.share @ breaks,
+        breaks=slices.share @ breaks(),
         below_floor=passing(np.full(tubes, np.nextafter(scene.fragments.size_floor, 0.0))),
         passing=passing(np.tile(sieves[:, None], tubes)).T,
         percentiles=closed_form.percentile(passing, np.tile(fractions, tubes), feed.largest_grain),
@@ -173,35 +187,47 @@ def _zone(slices: Slices, at_edge: bool) -> np.ndarray:
     return share / share.sum()
 
 
-def _summarised(scene: Scene, cells: Cells, slices: Slices) -> Crushed:
-    """Sum up the product, snapshots pooled."""
-    product = cells.product
-    pooled = np.sort(product.transpose(1, 0, 2).reshape(product.shape[1], -1), axis=1)
-    below_floor = np.nextafter(scene.fragments.size_floor, 0.0)
-    counts = np.empty((pooled.shape[0], 1 + len(scene.resolution.sieves)), np.int64)
-    kernels.passing_counts(pooled, np.append(below_floor, march.cell_sieves(scene)), counts)
-    # (slice, streamline, ...)
-    breaks, passing, pooled = (
-        part.reshape(slices.share.size, -1, *part.shape[1:]) for part in (cells.breaks.astype(float), counts, pooled)
-    )
-    passing, breaks = passing / pooled.shape[-1], breaks / pooled.shape[-1]
+def _summarised(scene: Scene, cells: Cells, slices: Slices, exact: Callable | None = None) -> Crushed:
+    """Sum up the product, snapshots pooled; corrected by what complete crushing comes to, if that is known."""
+    floor = np.nextafter(scene.fragments.size_floor, 0.0)
+    pooled = _pooled(cells.product, slices)
+    passing = _passing(pooled, np.append(floor, march.cell_sieves(scene)))
+    control = None
+    if exact is not None:
+        control = Control(_pooled(cells.complete, slices), exact)
+        passing = control.corrected(passing, np.append(floor, scene.resolution.sieves))
+    breaks = cells.breaks.reshape(slices.share.size, -1) / pooled.shape[-1]
     combined = np.tensordot(slices.share, passing, axes=1)
     return Crushed(
         breaks=slices.share @ breaks,
         below_floor=combined[:, 0],
         passing=combined[:, 1:],
-        percentiles=_percentiles(pooled, slices.share),
-        total_percentiles=_percentiles(_whole(pooled), slices.share)[:, 0],
+        percentiles=_percentiles(pooled, slices.share, control),
+        total_percentiles=_percentiles(_whole(pooled), slices.share, control)[:, 0],
         size=cells.size,
         mass_fraction=None if cells.classes is None else cells.classes[..., :-1] / scene.resolution.cells,
-        along_width=None if scene.roll_width is None else _along_width(slices, passing[..., 1:], pooled),
+        along_width=None if scene.roll_width is None else _along_width(slices, passing[..., 1:], pooled, control),
     )
 
 
-def _along_width(slices: Slices, passing: np.ndarray, pooled: np.ndarray) -> AlongWidth:
+def _pooled(product: np.ndarray, slices: Slices) -> np.ndarray:
+    """Return the cells (slice, streamline, cell) of all snapshots, sorted."""
+    lines = product.shape[1]
+    return np.sort(product.transpose(1, 0, 2).reshape(slices.share.size, lines // slices.share.size, -1), axis=-1)
+
+
+def _passing(pooled: np.ndarray, sieves: np.ndarray) -> np.ndarray:
+    """Return the part of the sorted cells (..., cell) that passes each sieve, (..., sieve)."""
+    counts = np.empty((*pooled.shape[:-1], sieves.size), np.int64)
+    kernels.passing_counts(pooled.reshape(-1, pooled.shape[-1]), sieves, counts.reshape(-1, sieves.size))
+    return counts / pooled.shape[-1]
+
+
+def _along_width(slices: Slices, passing: np.ndarray, pooled: np.ndarray, control: "Control | None") -> AlongWidth:
     each, whole = passing.mean(axis=1), _whole(pooled)
     zones = [_zone(slices, at_edge) for at_edge in (False, True)]
-    return AlongWidth(each, *(zone @ each for zone in zones), *(_percentiles(whole, zone)[:, 0] for zone in zones))
+    percentiles = (_percentiles(whole, zone, control)[:, 0] for zone in zones)
+    return AlongWidth(each, *(zone @ each for zone in zones), *percentiles)
 
 
 def _whole(cells: np.ndarray) -> np.ndarray:
@@ -209,24 +235,72 @@ def _whole(cells: np.ndarray) -> np.ndarray:
     return np.sort(cells.reshape(cells.shape[0], 1, -1), axis=-1)
 
 
-def _percentiles(cells: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Return the percentiles (fraction, line) of sorted cells (slice, line, cell), each slice with its share of mass.
+def _percentiles(cells: np.ndarray, share: np.ndarray, control: "Control | None") -> np.ndarray:
+    """Return the percentiles (fraction, line) of sorted cells (slice, line, cell), each slice with its share of mass."""
+    fractions = np.repeat(np.array(FRACTIONS)[:, None], cells.shape[1], axis=1)
+    found = _quantiles(cells, share, fractions)
+    return found if control is None else _quantiles(cells, share, control.to_read(found, fractions, share))
+
+
+def _quantiles(cells: np.ndarray, share: np.ndarray, fractions: np.ndarray) -> np.ndarray:
+    """Return the quantiles at fractions (fraction, line).
 
     Of one slice linear between cells as np.quantile's are; of several the first size that reaches the fraction.
     """
+    lines = np.arange(cells.shape[1])
     if share.size > 1:
         cells, share = cells[share > 0], share[share > 0]
-        return np.array([_weighted(cells[:, line], share) for line in range(cells.shape[1])]).T
-    place = np.array(FRACTIONS) * (cells.shape[2] - 1)
+        return np.array([_weighted(cells[:, line], share, fractions[:, line]) for line in lines]).T
+    place = fractions * (cells.shape[2] - 1)
     before = place.astype(int)
     after = np.minimum(before + 1, cells.shape[2] - 1)
-    low, high = (cells[0][:, k].astype(float) for k in (before, after))
-    return (low + (high - low) * (place - before)).T
+    low, high = (cells[0][lines, k].astype(float) for k in (before, after))
+    return low + (high - low) * (place - before)
 
 
-def _weighted(cells: np.ndarray, share: np.ndarray) -> np.ndarray:
+def _weighted(cells: np.ndarray, share: np.ndarray, fractions: np.ndarray) -> np.ndarray:
     order = np.argsort(cells, axis=None)
     reached = share[order // cells.shape[1]]
     np.cumsum(reached, out=reached)  # np.quantile with weights takes twice the memory and three times as long
     reached /= reached[-1]
-    return cells.ravel()[order[np.searchsorted(reached, FRACTIONS)]].astype(float)
+    return cells.ravel()[order[np.searchsorted(reached, fractions)]].astype(float)
+
+
+class Control(NamedTuple):
+    """The same cells without cushioning as a control variate.
+
+    A grain ends no coarser without cushioning than with it: F = P(X <= x | Y <= x) P(Y <= x). The second factor is
+    known exactly and the first, which scatters less, is counted: F is the cells' own, times the exact passing of Y
+    over theirs. That is the regression on Y <= x, whose slope is P(X <= x) / P(Y <= x) here.
+
+    Attributes
+    ----------
+    complete : ndarray
+        (slice, streamline, cell) sorted sizes Y, m.
+    exact : callable
+        Passing of Y, (..., slice, streamline), as a function of size, m.
+    """
+
+    complete: np.ndarray
+    exact: Callable
+
+    def corrected(self, passing: np.ndarray, sieves: np.ndarray) -> np.ndarray:
+        """Return the passing (slice, streamline, sieve); where no cell tells, the ratio is that of all lines."""
+        counted = _passing(self.complete, sieves.astype(np.float32).astype(float))
+        exact = np.moveaxis(self.exact(size=sieves[:, None, None]), 0, -1)
+        with np.errstate(invalid="ignore"):
+            of_all = np.nan_to_num(passing.sum(axis=(0, 1)) / counted.sum(axis=(0, 1)))
+            ratio = np.where(counted > 0, passing / counted, of_all)
+        return np.maximum.accumulate(ratio * exact, axis=-1)
+
+    def to_read(self, sizes: np.ndarray, fractions: np.ndarray, share: np.ndarray) -> np.ndarray:
+        """Return the fractions (fraction, line) at which the cells have the percentiles that they have at `sizes`."""
+        reached = sizes[:, None, :] * _ROUNDED  # (fraction, slice, line), or a line for all
+        counted = (self.complete <= reached[..., None]).mean(axis=-1)
+        exact = self.exact(size=np.broadcast_to(reached, counted.shape))
+        parts = [np.tensordot(share, part, axes=(0, 1)) for part in (counted, exact)]
+        if sizes.shape[1] == 1:
+            parts = [part.mean(axis=-1, keepdims=True) for part in parts]
+        counted, exact = parts
+        ratio = np.divide(counted, exact, out=np.ones_like(exact), where=exact > 0)
+        return np.minimum(fractions * ratio, 1.0)
