@@ -62,7 +62,7 @@ def run_scene(scene: Scene, seed: int = 0, replicate: int = 0, beds: Beds | None
     (0.059, 4000000)
     """
     scene, bed = load(scene, beds)
-    crushed = solve.crush(scene, bed, seed, replicate)
+    [crushed] = solve.crush(scene, bed, seed, [replicate])
     throughput = metrics.gap_throughput(scene, float(bed.stress.solid_fraction[:, -1].mean()))
     performance = machine.performance(scene, bed.pressed, throughput)
     found = flags.diagnose(scene, bed, performance, crushed)

@@ -198,7 +198,7 @@ def _grid_of(level: str) -> tuple[int, ...]:
 
 def _solvers(scene: Scene) -> dict[str, Scene]:
     """Return the scene without cushioning by solver; the closed form needs a finite Weibull modulus."""
-    marched = scene.with_values({"strength.cushioning": _FREE})
+    marched = scene.with_values({"strength.cushioning": _FREE, "resolution.control_variate": False})
     still = marched.with_values({"exchange": {"segregation": 0.0, "mixing": 0.0}})
     closed = {"closed form": scene.with_values({"strength.cushioning": "inf"})}
     return (closed if np.isfinite(scene.strength.weibull_modulus) else {}) | {"march": marched, "lattice": still}

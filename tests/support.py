@@ -152,7 +152,7 @@ def under(stress, time_step=1.0):
 
 def crush(scene, stress, seed=0, replicate=0):
     """Crush a scene without exchange under a given stress (streamline, point), Pa."""
-    return solve.crush(scene, under(stress), seed, replicate)
+    return solve.crush(scene, under(stress), seed, [replicate])[0]
 
 
 def draw(feed, cells, source):

@@ -110,7 +110,7 @@ def test_scatter_and_parents_of_the_closed_form_are_the_march_run_to_completion(
     sizes = np.geomspace(1e-7, 0.06, 2000)
     shares = np.searchsorted(np.sort(found), sizes) / cells
     assert np.abs(shares - passing(size=sizes[:, None])[:, 0]).max() < KS / math.sqrt(cells) + 1e-4
-    assert count / cells == pytest.approx(float(breaks[0]), abs=SIGMAS * math.sqrt(12 / cells))
+    assert count / cells == pytest.approx(float(breaks()[0]), abs=SIGMAS * math.sqrt(12 / cells))
 
 
 @each

@@ -516,6 +516,8 @@ def other_value(name, value):
         return "cells" if value == "distributions" else None
     if name in OTHER or isinstance(value, str | None):
         return OTHER.get(name)
+    if isinstance(value, bool):
+        return not value
     return value + 1 if isinstance(value, int) else 3.0 if math.isinf(value) else 0.95 * value or 0.5
 
 

@@ -63,12 +63,14 @@ def _cascade(feed: Feed, strength: Strength, fragments: Fragments, critical: np.
     ever = np.repeat(feed_mass[:, None], critical.size, axis=1)
     kernels.cascade(ever, leaving, np.pad(np.exp(-gamma[:, 0] * width), (1, 0)))
     tries = chance * (1 + chance * (1 - within) / np.maximum(1 - chance, 1e-9 / (gamma * width)))
-    return edges, np.cumsum(ever * (1 - leaving), axis=0), np.sum(ever[1:] * tries, axis=0)
+    cumulative = np.cumsum(ever * (1 - leaving), axis=0)
+    return edges, cumulative / cumulative[-1], np.sum(ever[1:] * tries, axis=0)  # 1 but for rounding
 
 
 def _between(edges: np.ndarray, cumulative: np.ndarray, size) -> np.ndarray:
     """Return passing at sizes (..., *line), m, linear in log size between the edges of the cascade's classes."""
     size = np.broadcast_to(size, np.broadcast_shapes(np.shape(size), cumulative.shape[1:]))
+    cumulative = np.broadcast_to(cumulative, cumulative.shape[:1] + size.shape[size.ndim - cumulative.ndim + 1 :])
     place = (np.log(np.maximum(size, math.exp(edges[0]))) - edges[0]) / (edges[1] - edges[0])
     before = np.clip(place.astype(int), 0, edges.size - 2)
     lines = np.ogrid[tuple(slice(n) for n in size.shape)][size.ndim - cumulative.ndim + 1 :]

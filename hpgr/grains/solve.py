@@ -1,7 +1,7 @@
 """Picks the cheapest solver the scene allows, runs it, and sums up the product (docs/model.md, Solvers)."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -102,8 +102,8 @@ def crushing_stress(scene: Scene, bed: LoadedBed) -> np.ndarray:
     return np.where(bed.kinematics.volumetric_rate > 0, stress, 0.0)
 
 
-def crush(scene: Scene, bed: LoadedBed, seed: int, replicate: int) -> Crushed | None:
-    """Crush the feed of `scene` in its loaded bed; None for a stress-only scene.
+def crush(scene: Scene, bed: LoadedBed, seed: int, replicates: Sequence[int]) -> list[Crushed | None]:
+    """Crush the feed of `scene` in its loaded bed, once for every replicate; None for a stress-only scene.
 
     Parameters
     ----------
@@ -111,23 +111,24 @@ def crush(scene: Scene, bed: LoadedBed, seed: int, replicate: int) -> Crushed | 
         What is simulated.
     bed : LoadedBed
         Its bed, tessellated if the lattice is the solver.
-    seed, replicate : int
-        Keys of the randomness.
+    seed : int
+        Key of the randomness, with the replicates.
+    replicates : sequence of int
+        Independent repetitions, which share what is known without random numbers.
     """
     solver = choose(scene)
     if solver == "stress only":
-        return None
+        return [None] * len(replicates)
     log_stress = scene.strength.log_stress(crushing_stress(scene, bed))
     slices = WHOLE if scene.roll_width is None else scene.roll_width.cut(scene.rolls.gap, scene.rolls.width)
     if solver == "closed form":
-        return _closed_form(scene, log_stress, slices)
-    if solver in ("lattice", "reduced lattice"):
-        cells, exchanged = lattice.run(scene, log_stress, bed, seed, replicate, reduced=solver != "lattice")
-        return _summarised(scene, cells, slices)._replace(exchanged=exchanged)
-    if not is_controlled(scene):
-        return _summarised(scene, march.march(scene, log_stress, slices, seed, replicate), slices)
-    cells = march.march(scene, log_stress, slices, seed, replicate, complete=True)
-    return _summarised(scene, cells, slices, _complete(scene, log_stress.max(axis=1), slices)[0])
+        return [_closed_form(scene, log_stress, slices)] * len(replicates)
+    if solver.endswith("lattice"):
+        found = [lattice.run(scene, log_stress, bed, seed, one, reduced=solver != "lattice") for one in replicates]
+        return [_summarised(scene, [cells], slices)[0]._replace(exchanged=exchanged) for cells, exchanged in found]
+    complete = _complete(scene, log_stress.max(axis=1)[None], slices)[0] if is_controlled(scene) else None
+    found = march.march(scene, log_stress, slices, seed, replicates, complete is not None)
+    return _summarised(scene, list(found), slices, complete)
 
 
 def _complete(scene: Scene, highest: np.ndarray, slices: Slices) -> tuple[Callable, Callable]:
@@ -187,33 +188,48 @@ def _zone(slices: Slices, at_edge: bool) -> np.ndarray:
     return share / share.sum()
 
 
-def _summarised(scene: Scene, cells: Cells, slices: Slices, exact: Callable | None = None) -> Crushed:
-    """Sum up the product, snapshots pooled; corrected by what complete crushing comes to, if that is known."""
+def _summarised(
+    scene: Scene, replicates: list[Cells], slices: Slices, exact: Callable | None = None
+) -> list[Crushed | None]:
+    """Sum up the products, snapshots pooled; corrected by what complete crushing comes to, if that is known."""
     floor = np.nextafter(scene.fragments.size_floor, 0.0)
-    pooled = _pooled(cells.product, slices)
+    pooled = _pooled([cells.product for cells in replicates], slices)
     passing = _passing(pooled, np.append(floor, march.cell_sieves(scene)))
     control = None
     if exact is not None:
-        control = Control(_pooled(cells.complete, slices), exact)
+        control = Control(_pooled([cells.complete for cells in replicates], slices), exact)
         passing = control.corrected(passing, np.append(floor, scene.resolution.sieves))
-    breaks = cells.breaks.reshape(slices.share.size, -1) / pooled.shape[-1]
     combined = np.tensordot(slices.share, passing, axes=1)
-    return Crushed(
-        breaks=slices.share @ breaks,
-        below_floor=combined[:, 0],
-        passing=combined[:, 1:],
-        percentiles=_percentiles(pooled, slices.share, control),
-        total_percentiles=_percentiles(_whole(pooled), slices.share, control)[:, 0],
-        size=cells.size,
-        mass_fraction=None if cells.classes is None else cells.classes[..., :-1] / scene.resolution.cells,
-        along_width=None if scene.roll_width is None else _along_width(slices, passing[..., 1:], pooled, control),
-    )
+    percentiles = _percentiles(pooled, slices.share, control)
+    whole = _whole(pooled)
+    total = _percentiles(whole, slices.share, control)[..., 0]
+    zones = [_zone(slices, at_edge) for at_edge in (False, True)] if scene.roll_width else []
+    apart = [_percentiles(whole, zone, control)[..., 0] for zone in zones]
+
+    def along_width(k: int) -> AlongWidth:
+        each = passing[:, k, :, 1:].mean(axis=1)
+        return AlongWidth(each, *(zone @ each for zone in zones), *(part[:, k] for part in apart))
+
+    return [
+        Crushed(
+            breaks=slices.share @ cells.breaks.reshape(slices.share.size, -1) / pooled.shape[-1],
+            below_floor=combined[k, :, 0],
+            passing=combined[k, :, 1:],
+            percentiles=percentiles[:, k],
+            total_percentiles=total[:, k],
+            size=cells.size,
+            mass_fraction=None if cells.classes is None else cells.classes[..., :-1] / scene.resolution.cells,
+            along_width=along_width(k) if zones else None,
+        )
+        for k, cells in enumerate(replicates)
+    ]
 
 
-def _pooled(product: np.ndarray, slices: Slices) -> np.ndarray:
-    """Return the cells (slice, streamline, cell) of all snapshots, sorted."""
-    lines = product.shape[1]
-    return np.sort(product.transpose(1, 0, 2).reshape(slices.share.size, lines // slices.share.size, -1), axis=-1)
+def _pooled(products: list[np.ndarray], slices: Slices) -> np.ndarray:
+    """Return the cells (slice, replicate, streamline, cell) of products (snapshot, line, cell), sorted."""
+    by_line = np.stack(products).transpose(2, 0, 1, 3)
+    by_line = by_line.reshape(slices.share.size, -1, *by_line.shape[1:]).transpose(0, 2, 1, 3, 4)
+    return np.sort(by_line.reshape(*by_line.shape[:3], -1), axis=-1)
 
 
 def _passing(pooled: np.ndarray, sieves: np.ndarray) -> np.ndarray:
@@ -223,38 +239,37 @@ def _passing(pooled: np.ndarray, sieves: np.ndarray) -> np.ndarray:
     return counts / pooled.shape[-1]
 
 
-def _along_width(slices: Slices, passing: np.ndarray, pooled: np.ndarray, control: "Control | None") -> AlongWidth:
-    each, whole = passing.mean(axis=1), _whole(pooled)
-    zones = [_zone(slices, at_edge) for at_edge in (False, True)]
-    percentiles = (_percentiles(whole, zone, control)[:, 0] for zone in zones)
-    return AlongWidth(each, *(zone @ each for zone in zones), *percentiles)
-
-
 def _whole(cells: np.ndarray) -> np.ndarray:
-    """Return the cells (slice, line, cell) of all lines of each slice as those of one, sorted."""
-    return np.sort(cells.reshape(cells.shape[0], 1, -1), axis=-1)
+    """Return the cells (slice, replicate, line, cell) of all lines as those of one, sorted."""
+    return np.sort(cells.reshape(*cells.shape[:2], 1, -1), axis=-1)
 
 
 def _percentiles(cells: np.ndarray, share: np.ndarray, control: "Control | None") -> np.ndarray:
-    """Return the percentiles (fraction, line) of sorted cells (slice, line, cell), each slice with its share of mass."""
-    fractions = np.repeat(np.array(FRACTIONS)[:, None], cells.shape[1], axis=1)
+    """Return the percentiles (fraction, replicate, line) of sorted cells (slice, replicate, line, cell).
+
+    Each slice has its share of mass.
+    """
+    fractions = np.empty((len(FRACTIONS), *cells.shape[1:3]))
+    fractions[:] = np.array(FRACTIONS)[:, None, None]
     found = _quantiles(cells, share, fractions)
     return found if control is None else _quantiles(cells, share, control.to_read(found, fractions, share))
 
 
 def _quantiles(cells: np.ndarray, share: np.ndarray, fractions: np.ndarray) -> np.ndarray:
-    """Return the quantiles at fractions (fraction, line).
+    """Return the quantiles at fractions (fraction, replicate, line).
 
     Of one slice linear between cells as np.quantile's are; of several the first size that reaches the fraction.
     """
-    lines = np.arange(cells.shape[1])
     if share.size > 1:
-        cells, share = cells[share > 0], share[share > 0]
-        return np.array([_weighted(cells[:, line], share, fractions[:, line]) for line in lines]).T
-    place = fractions * (cells.shape[2] - 1)
+        cells, share, found = cells[share > 0], share[share > 0], np.empty_like(fractions)
+        for k, line in np.ndindex(fractions.shape[1:]):
+            found[:, k, line] = _weighted(cells[:, k, line], share, fractions[:, k, line])
+        return found
+    place = fractions * (cells.shape[-1] - 1)
     before = place.astype(int)
-    after = np.minimum(before + 1, cells.shape[2] - 1)
-    low, high = (cells[0][lines, k].astype(float) for k in (before, after))
+    after = np.minimum(before + 1, cells.shape[-1] - 1)
+    replicate, line = np.ogrid[: cells.shape[1], : cells.shape[2]]
+    low, high = (cells[0][replicate, line, k].astype(float) for k in (before, after))
     return low + (high - low) * (place - before)
 
 
@@ -276,31 +291,31 @@ class Control(NamedTuple):
     Attributes
     ----------
     complete : ndarray
-        (slice, streamline, cell) sorted sizes Y, m.
+        (slice, replicate, streamline, cell) sorted sizes Y, m.
     exact : callable
-        Passing of Y, (..., slice, streamline), as a function of size, m.
+        Passing of Y, (..., slice, replicate or 1, streamline), as a function of size, m.
     """
 
     complete: np.ndarray
     exact: Callable
 
     def corrected(self, passing: np.ndarray, sieves: np.ndarray) -> np.ndarray:
-        """Return the passing (slice, streamline, sieve); where no cell tells, the ratio is that of all lines."""
+        """Return the passing (slice, replicate, streamline, sieve)."""
         counted = _passing(self.complete, sieves.astype(np.float32).astype(float))
-        exact = np.moveaxis(self.exact(size=sieves[:, None, None]), 0, -1)
-        with np.errstate(invalid="ignore"):
-            of_all = np.nan_to_num(passing.sum(axis=(0, 1)) / counted.sum(axis=(0, 1)))
-            ratio = np.where(counted > 0, passing / counted, of_all)
-        return np.maximum.accumulate(ratio * exact, axis=-1)
+        exact = np.moveaxis(self.exact(size=sieves[:, None, None, None]), 0, -1)
+        # where no cell tells, the ratio is that of the next coarser sieve: 0 would be too little in the mean
+        coarser = np.where(counted > 0, np.arange(sieves.size), sieves.size - 1)
+        coarser = np.minimum.accumulate(coarser[..., ::-1], axis=-1)[..., ::-1]
+        ratio = np.divide(passing, counted, out=np.zeros_like(passing), where=counted > 0)
+        return np.maximum.accumulate(np.take_along_axis(ratio, coarser, axis=-1) * exact, axis=-1)
 
     def to_read(self, sizes: np.ndarray, fractions: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """Return the fractions (fraction, line) at which the cells have the percentiles that they have at `sizes`."""
-        reached = sizes[:, None, :] * _ROUNDED  # (fraction, slice, line), or a line for all
-        counted = (self.complete <= reached[..., None]).mean(axis=-1)
+        """Return the fractions (fraction, replicate, line) at which to read percentiles that are about `sizes`."""
+        reached = sizes[:, None] * _ROUNDED  # (fraction, slice, replicate, streamline, or one for all)
+        counted = np.count_nonzero(self.complete <= reached[..., None], axis=-1) / self.complete.shape[-1]
         exact = self.exact(size=np.broadcast_to(reached, counted.shape))
-        parts = [np.tensordot(share, part, axes=(0, 1)) for part in (counted, exact)]
-        if sizes.shape[1] == 1:
-            parts = [part.mean(axis=-1, keepdims=True) for part in parts]
-        counted, exact = parts
+        counted, exact = (np.tensordot(share, part, axes=(0, 1)) for part in (counted, exact))
+        if sizes.shape[-1] == 1:
+            counted, exact = (part.mean(axis=-1, keepdims=True) for part in (counted, exact))
         ratio = np.divide(counted, exact, out=np.ones_like(exact), where=exact > 0)
-        return np.minimum(fractions * ratio, 1.0)
+        return np.maximum.accumulate(np.minimum(fractions * ratio, 1.0))

@@ -1,0 +1,148 @@
+"""The control variate: the product of the march, corrected by what its cells come to without cushioning."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import paper, sized
+
+from hpgr import simulate
+from hpgr.grains import march, solve
+from hpgr.laws.roll_width import WHOLE
+from hpgr.run import load
+
+REPLICATES = 200
+LIMIT = 4.5  # standard errors; a normal deviate leaves them once in 147,000
+BASE = {"resolution.record": "product", "resolution.points": 60}
+TABLE = {"kind": "table", "table": [[0.001, 0], [0.004, 30], [0.02, 60], [0.06, 100]]}
+SCENES = {
+    "paper": {},
+    "much shielding": {"strength.cushioning": 0.5},
+    "little shielding": {"strength.cushioning": 2.0},
+    "feed of a laboratory": {"feed": TABLE, "strength.cushioning": 0.5},
+    "scatter": {"strength.scatter": 2.0},
+    "fragments by parent": {
+        "fragments.size_exponent": 0.7,
+        "fragments.reference_size": 0.01,
+        "strength.cushioning": 2.0,
+    },
+    "fines": {"fragments.exponent": 0.35},
+    "roll width": {"roll_width": {"slices": 2, "pressure_drop": 0.8}},
+}
+SIEVES = (8, 18, 24, 30, 33)  # 6 um, 63 um, 0.25, 1 and 2 mm
+
+
+def products(values, cells, replicates=REPLICATES, **more):
+    """Products of a scene in its bed, with the control variate and without."""
+    scene, bed = load(paper(BASE | {"resolution.cells": cells} | values))
+    for used in (True, False):
+        chosen = scene.with_values({"resolution.control_variate": used})
+        yield solve.crush(chosen, bed, 0, range(replicates))
+
+
+def figures(crushed):
+    return [
+        [*one.total_percentiles, *one.passing.mean(axis=0)[list(SIEVES)], *one.percentiles[:, -1]] for one in crushed
+    ]
+
+
+@pytest.mark.parametrize("values", SCENES.values(), ids=SCENES)
+def test_the_mean_stays(values):
+    """Pairs of the same cells; 9 figures of 8 scenes leave `LIMIT` standard errors by chance once in 2,000 runs.
+
+    A ratio of counts is off by less than its error over the square root of the cells, of which 200 means see little.
+    """
+    corrected, plain = (np.array(figures(found)) for found in products(values, sized(1000, 100), sized(REPLICATES, 20)))
+    off = corrected - plain
+    error = off.std(axis=0, ddof=1) / np.sqrt(len(off))
+    assert np.all(np.abs(off.mean(axis=0)) <= LIMIT * error + 1e-12)
+
+
+def test_the_scatter_falls():
+    """The ratio of standard deviations of 200 is known to 7 %: 0.51, 0.8 and 0.46 pass the bounds once in 10,000."""
+    corrected, plain = (np.array(figures(found)) for found in products({}, sized(1000, 200), sized(REPLICATES, 40)))
+    p50, p80, *passing = corrected.std(axis=0) / plain.std(axis=0)
+    slack = sized(1.0, 1.3)
+    assert p50 < 0.66 * slack
+    assert p80 < 1.0 * slack
+    assert passing[3] < 0.6 * slack  # 1 mm
+
+
+@settings(max_examples=sized(40, 5), deadline=None)
+@given(
+    st.sampled_from(
+        [*SCENES.values(), {"feed": {"kind": "single", "size": "50 mm"}}, {"strength.reference_strength": 1e12}]
+    ),
+    st.sampled_from([0.2, 1.0, 30.0]),
+    st.sampled_from([1, 2, 3, 17, 250]),
+    st.sampled_from([1, 3]),
+)
+def test_passing_rises_within_0_and_1(values, cushioning, cells, snapshots):
+    values = values | {"strength.cushioning": cushioning, "resolution.snapshots": snapshots}
+    for crushed in next(products(values, cells, replicates=3)):
+        for passing in (crushed.passing, crushed.passing.mean(axis=0)):
+            assert np.all(np.diff(passing, axis=-1) >= 0)
+            assert np.all((passing >= 0) & (passing <= 1))
+        assert np.all(crushed.passing[:, -1] == 1)  # 1 m
+        assert np.all((crushed.below_floor >= 0) & (crushed.below_floor <= crushed.passing[:, 5]))
+        assert np.all(crushed.total_percentiles > 0)
+        assert np.all(np.diff(crushed.percentiles, axis=0) >= 0)
+
+
+def marched(values, complete):
+    scene, bed = load(paper(BASE | values))
+    log_stress = scene.strength.log_stress(solve.crushing_stress(scene, bed))
+    [found] = march.march(scene, log_stress, WHOLE, 0, [0], complete)
+    return scene, log_stress, found
+
+
+@pytest.mark.parametrize(
+    "values", [{}, SCENES["scatter"], SCENES["fragments by parent"]], ids=["paper", "scatter", "parent"]
+)
+def test_cells_run_on_to_what_they_come_to_without_cushioning(values):
+    """Bit for bit what a march without cushioning leaves, whose bed stays at its peak long enough."""
+    scene, log_stress, found = marched(values, complete=True)
+    assert np.all(found.complete <= found.product)
+    assert np.any(found.complete < found.product)
+    still = np.repeat(log_stress.max(axis=1, keepdims=True), 100, axis=1)
+    free = scene.with_values({"strength.cushioning": "inf"})
+    [wanted] = march.march(free, np.hstack([log_stress, still]), WHOLE, 0, [0])
+    assert np.array_equal(found.complete, wanted.product)
+
+
+def test_steps_of_complete_crushing_are_as_many_as_it_takes(monkeypatch):
+    *_, found = marched({"fragments.exponent": 9.0}, complete=True)
+    monkeypatch.setattr(march, "_STEPS", 2)
+    *_, slowly = marched({"fragments.exponent": 9.0}, complete=True)
+    assert np.array_equal(found.complete, slowly.complete)
+
+
+def test_little_cushioning_is_the_closed_form():
+    """What every cell comes to without cushioning is known exactly, so little is left to chance."""
+    corrected, plain = (
+        next(iter(found)) for found in products({"strength.cushioning": 100.0, "resolution.points": 400}, 50, 1)
+    )
+    _, bed = load(paper(BASE | {"resolution.points": 400}))
+    [exact] = solve.crush(paper(BASE | {"resolution.points": 400, "strength.cushioning": "inf"}), bed, 0, [0])
+    off, before = (np.abs(found.passing - exact.passing).max() for found in (corrected, plain))
+    assert off < 0.03 < before
+
+
+def test_recorded_cells_count_for_themselves():
+    """Figures of a Dataset that holds its cells are those of the cells, and of the same scene without correction."""
+    scene = paper({"resolution.points": 40, "resolution.cells": 60})
+    recorded, found = simulate(scene), simulate(scene.with_values({"resolution.record": "product"}))
+    plain = simulate(scene.with_values({"resolution.record": "product", "resolution.control_variate": False}))
+    assert (recorded.attrs["solver"], found.attrs["solver"]) == ("march", "march, control variate")
+    assert np.array_equal(recorded["passing"], plain["passing"])
+    assert np.array_equal(recorded["p80"], plain["p80"])
+    assert not np.array_equal(found["passing"], plain["passing"])
+
+
+def test_replicates_at_once_are_those_one_by_one():
+    scene, bed = load(paper(BASE | {"resolution.cells": 50}))
+    together = solve.crush(scene, bed, 7, [2, 0])
+    for replicate, found in zip((2, 0), together, strict=True):
+        [alone] = solve.crush(scene, bed, 7, [replicate])
+        for name in ("passing", "percentiles", "total_percentiles", "breaks", "below_floor"):
+            assert np.array_equal(getattr(alone, name), getattr(found, name)), name
