@@ -197,8 +197,8 @@ class Resolution(Frozen):
     at the exit).
     """
     control_variate: bool = True
-    """Whether a product that cells sample is corrected by what the same cells come to without cushioning, which is
-    known exactly; only where the product alone is recorded, as recorded cells count for themselves.
+    """Whether the product that cells sample is corrected by what the same cells come to without cushioning, of which
+    the mean is known; what is recorded of the cells themselves is never corrected.
     """
     sieves: tuple[Metres, ...] = quantity(
         _default_sieves(),

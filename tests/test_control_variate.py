@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import paper, sized
 
-from hpgr import simulate
+from hpgr import passing, percentile_size, simulate
 from hpgr.grains import march, solve
 from hpgr.laws.roll_width import WHOLE
 from hpgr.run import load
@@ -80,11 +80,10 @@ def test_the_scatter_falls():
 def test_passing_rises_within_0_and_1(values, cushioning, cells, snapshots):
     values = values | {"strength.cushioning": cushioning, "resolution.snapshots": snapshots}
     for crushed in next(products(values, cells, replicates=3)):
-        for passing in (crushed.passing, crushed.passing.mean(axis=0)):
-            assert np.all(np.diff(passing, axis=-1) >= 0)
-            assert np.all((passing >= 0) & (passing <= 1))
+        for found in (crushed.passing, crushed.passing.mean(axis=0)):
+            assert np.all(np.diff(found, axis=-1) >= 0)
+            assert np.all((found >= 0) & (found <= 1))
         assert np.all(crushed.passing[:, -1] == 1)  # 1 m
-        assert np.all((crushed.below_floor >= 0) & (crushed.below_floor <= crushed.passing[:, 5]))
         assert np.all(crushed.total_percentiles > 0)
         assert np.all(np.diff(crushed.percentiles, axis=0) >= 0)
 
@@ -128,15 +127,25 @@ def test_little_cushioning_is_the_closed_form():
     assert off < 0.03 < before
 
 
-def test_recorded_cells_count_for_themselves():
-    """Figures of a Dataset that holds its cells are those of the cells, and of the same scene without correction."""
-    scene = paper({"resolution.points": 40, "resolution.cells": 60})
-    recorded, found = simulate(scene), simulate(scene.with_values({"resolution.record": "product"}))
-    plain = simulate(scene.with_values({"resolution.record": "product", "resolution.control_variate": False}))
-    assert (recorded.attrs["solver"], found.attrs["solver"]) == ("march", "march, control variate")
-    assert np.array_equal(recorded["passing"], plain["passing"])
-    assert np.array_equal(recorded["p80"], plain["p80"])
-    assert not np.array_equal(found["passing"], plain["passing"])
+@pytest.mark.parametrize("record", ["cells", "distributions"])
+def test_what_is_recorded_is_not_corrected(record):
+    """The product is the same whatever is recorded; the cells and their distributions are those without correction."""
+    scene = paper({"resolution.points": 40, "resolution.cells": 60, "resolution.snapshots": 2})
+    found = {
+        (kept, used): simulate(scene.with_values({"resolution.record": kept, "resolution.control_variate": used}))
+        for kept in ("product", record)
+        for used in (True, False)
+    }
+    for used, solver in ((True, "march, control variate"), (False, "march")):
+        for name in ("passing", "passing_total", "p50", "p80", "p80_total", "below_floor"):
+            assert np.array_equal(found["product", used][name], found[record, used][name]), name
+        assert found[record, used].attrs["solver"] == solver
+    corrected, plain = found[record, True], found[record, False]
+    kept = "size" if record == "cells" else "mass_fraction"
+    assert np.array_equal(corrected[kept], plain[kept])
+    assert not np.array_equal(corrected["passing"], plain["passing"])
+    assert np.array_equal(passing(corrected), corrected["passing"])
+    assert percentile_size(corrected, 80, total=True) == corrected["p80_total"]
 
 
 def test_replicates_at_once_are_those_one_by_one():

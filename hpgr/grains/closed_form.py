@@ -63,8 +63,9 @@ def _cascade(feed: Feed, strength: Strength, fragments: Fragments, critical: np.
     ever = np.repeat(feed_mass[:, None], critical.size, axis=1)
     kernels.cascade(ever, leaving, np.pad(np.exp(-gamma[:, 0] * width), (1, 0)))
     tries = chance * (1 + chance * (1 - within) / np.maximum(1 - chance, 1e-9 / (gamma * width)))
-    cumulative = np.cumsum(ever * (1 - leaving), axis=0)
-    return edges, cumulative / cumulative[-1], np.sum(ever[1:] * tries, axis=0)  # 1 but for rounding
+    cumulative = np.minimum(np.cumsum(ever * (1 - leaving), axis=0), 1.0)
+    cumulative[-1] = 1.0  # but for rounding
+    return edges, cumulative, np.sum(ever[1:] * tries, axis=0)
 
 
 def _between(edges: np.ndarray, cumulative: np.ndarray, size) -> np.ndarray:

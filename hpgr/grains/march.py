@@ -16,7 +16,7 @@ from hpgr.laws.roll_width import Slices
 from hpgr.scene import Scene
 
 _LARGE = 200_000  # cells of all parcels from which they are crushed on all cores
-_STEPS = 32  # of complete crushing in a call of the kernel; one call does nearly always
+_STEPS = 32  # of complete crushing in a call of the kernel; nothing is left after the first nearly always
 
 
 class Cells(NamedTuple):
@@ -94,15 +94,13 @@ def _complete(scene: Scene, parcels: Parcels, lines: np.ndarray, log_stress: np.
     the paper's scene).
     """
     loads = path(scene, np.repeat(log_stress.max(axis=1, keepdims=True), _STEPS, axis=1))
-    slots, needed = np.arange(lines.size), loads.critical_ratio[lines, 0]
+    slots = np.arange(lines.size)
     steps = Passage(slots, lines, 0 * slots, 0 * slots + _STEPS)
     laws, work = ore(scene)._replace(cushion=0.0), kernels.make_work(scene.resolution.cells)
     parcels.bounds_outdated[:], before = True, -1
     while parcels.breaks.sum() > before:
         before = parcels.breaks.sum()
         kernels.crush(parcels, steps, loads, laws, work, kernels.make_record())
-        if (parcels.block_bounds.max(axis=1) < needed).all():
-            return
 
 
 def march(

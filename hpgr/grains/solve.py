@@ -91,9 +91,9 @@ def choose(scene: Scene) -> str:
 
 def is_controlled(scene: Scene) -> bool:
     """Return whether the product of the march is corrected by the closed form (docs/model.md, Solvers)."""
-    strength, grid = scene.strength, scene.resolution
+    strength = scene.strength
     known = math.isfinite(strength.cushioning) and math.isfinite(strength.weibull_modulus)
-    return known and grid.control_variate and grid.record == "product" and choose(scene) == "march"
+    return known and scene.resolution.control_variate and choose(scene) == "march"
 
 
 def crushing_stress(scene: Scene, bed: LoadedBed) -> np.ndarray:
@@ -198,7 +198,8 @@ def _summarised(
     control = None
     if exact is not None:
         control = Control(_pooled([cells.complete for cells in replicates], slices), exact)
-        passing = control.corrected(passing, np.append(floor, scene.resolution.sieves))
+        # not what is below the floor: a limit is hit by cells, not in the mean
+        passing[..., 1:] = control.corrected(passing[..., 1:], np.array(scene.resolution.sieves))
     combined = np.tensordot(slices.share, passing, axes=1)
     percentiles = _percentiles(pooled, slices.share, control)
     whole = _whole(pooled)

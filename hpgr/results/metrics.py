@@ -24,8 +24,9 @@ def passing(dataset: xr.Dataset, sieves=None, point: int = -1, total: bool = Fal
     dataset : xarray.Dataset
         From `hpgr.simulate` or a study.
     sieves : array_like, optional
-        Sizes in m, or texts with a unit; default the recorded sieves. From recorded cells any size is exact;
-        otherwise sizes between sieves are interpolated linearly in log size.
+        Sizes in m, or texts with a unit; default the recorded sieves. Of recorded cells those are counted that pass;
+        otherwise sizes between sieves are interpolated linearly in log size. The product at the default sieves is
+        corrected by a control variate (`resolution.control_variate`), cells that are counted are not.
     point : int
         Material point; the default is the exit. Others need recorded cells or distributions.
     total : bool
@@ -50,7 +51,7 @@ def passing(dataset: xr.Dataset, sieves=None, point: int = -1, total: bool = Fal
     """
     _require_sizes(dataset, point)
     wanted = dataset["sieve"].values if sieves is None else _sizes(sieves)
-    if "size" in dataset:
+    if "size" in dataset and not (sieves is None and _is_exit(dataset, point)):
         as_cells = wanted.astype(np.float32)  # a grain of just a sieve's size passes it
         found = _over_cells(
             lambda row: np.searchsorted(row, as_cells, side="right") / row.size, dataset, point, ("sieve",)

@@ -219,6 +219,7 @@ def _draw_resolution(exchange: bool, width: bool, generator: np.random.Generator
         "resolution.cells": int(few if generator.random() < 0.3 else generator.integers(4, 65 if exchange else 201)),
         "resolution.snapshots": int(generator.integers(1, 4)),
         "resolution.record": records[generator.integers(len(records))],
+        "resolution.control_variate": bool(generator.random() < 0.8),
     } | ({"exchange.interval": int(generator.integers(1, 6))} if exchange else {})
     if generator.random() < 0.1:
         counted = [name for name in drawn if name in numeric_fields()]
