@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hpgr.grains import kernels
-from hpgr.grains.kernels import Ore, Parcels, Passage, Path
+from hpgr.grains.kernels import Ore, Parcels, Passage, Path, Record
 from hpgr.laws.roll_width import Slices
 from hpgr.scene import Scene
 
@@ -102,19 +102,19 @@ def march(scene: Scene, log_stress: np.ndarray, slices: Slices, seed: int, repli
     keys = [(replicate, line % tubes, snapshot) for snapshot, line in columns]
     lines, breaks = np.array([line for _, line in columns]), np.empty(len(columns), np.int64)
     product = np.empty((len(columns), grid.cells), np.float32)
-    kept = {
-        "cells": {"snapshots": (len(columns), points, grid.cells)},
-        "distributions": {"sieves": cell_sieves(scene), "classes": (len(columns), points, len(grid.sieves) + 1)},
-    }
-    record = kernels.make_record(**kept.get(grid.record, {}))
+    record = Record()
+    if grid.record == "cells":
+        record = Record(snapshots=np.empty((len(columns), points, grid.cells), np.float32))
+    if grid.record == "distributions":
+        sieves = cell_sieves(scene)
+        kept = np.empty((len(columns), points, sieves.size + 1), np.int64)
+        record = Record(sieves, np.empty((len(columns), sieves.size + 1), np.int64), kept)
 
     def crush(part: slice) -> None:
         parcels = first_cells(scene, seed, keys[part])
         slots = np.arange(parcels.breaks.size)
         passage = Passage(slots, lines[part], 0 * slots, 0 * slots + points)
-        own = record._replace(
-            counts=record.counts.copy(), snapshots=record.snapshots[part], classes=record.classes[part]
-        )
+        own = Record(record.sieves, *(None if kept is None else kept[part] for kept in record[1:]))
         kernels.crush(parcels, passage, loads, ore(scene), kernels.make_work(grid.cells), own)
         product[part], breaks[part] = parcels.sizes[:, 1:-1], parcels.breaks
 
@@ -125,6 +125,6 @@ def march(scene: Scene, log_stress: np.ndarray, slices: Slices, seed: int, repli
     return Cells(
         product.reshape(grid.snapshots, -1, grid.cells),
         breaks.reshape(grid.snapshots, -1).sum(axis=0),
-        record.snapshots.reshape(*shape, grid.cells) if record.snapshots.size else None,
-        record.classes.reshape(*shape, record.classes.shape[-1]) if record.classes.size else None,
+        None if record.snapshots is None else record.snapshots.reshape(*shape, grid.cells),
+        None if record.classes is None else record.classes.reshape(*shape, record.classes.shape[-1]),
     )
