@@ -37,7 +37,7 @@ def kernel_ms(scene, bed):
     path = march.path(scene, scene.strength.log_stress(solve.crushing_stress(scene, bed)))
     lines, points = np.arange(path.log_stress.shape[0]), path.log_stress.shape[1]
     passage = kernels.Passage(lines, lines, 0 * lines, 0 * lines + points)
-    work, record, times = kernels.make_work(scene.resolution.cells), kernels.make_record(), []
+    work, record, times = kernels.make_work(scene.resolution.cells), kernels.Record(), []
     for replicate in range(31):
         parcels = march.first_cells(scene, 0, [(replicate, line, 0) for line in lines])
         start = time.perf_counter()

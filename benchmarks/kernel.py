@@ -45,7 +45,7 @@ def ore(n):
 
 
 def copied(parcels):
-    return kernels.Parcels(*(array.copy() for array in parcels))
+    return kernels.Parcels(*(None if array is None else array.copy() for array in parcels))
 
 
 def bounded(parcels, log_stress, n):
@@ -53,7 +53,7 @@ def bounded(parcels, log_stress, n):
     one = np.zeros(1, int)
     passage = kernels.Passage(one, one, one, one + log_stress.shape[1])
     work = kernels.make_work(parcels.sizes.shape[1] - 2)
-    kernels.crush(parcels, passage, march.path(scene, log_stress), laws, work, kernels.make_record())
+    kernels.crush(parcels, passage, march.path(scene, log_stress), laws, work, kernels.Record())
 
 
 @njit

@@ -8,7 +8,7 @@ import numpy as np
 
 from hpgr import presets
 from hpgr.grains import kernels, solve
-from hpgr.grains.kernels import Passage, Path
+from hpgr.grains.kernels import Passage, Path, Record
 from hpgr.grains.march import ore
 from hpgr.laws.fragments import Fragments
 from hpgr.laws.strength import Strength
@@ -111,17 +111,17 @@ def march(sizes, streams, log_stress, sieves=(), every=False, kernel=kernels.cru
     given, log_stress, cells = laws(**constants), np.asarray(log_stress, float), sizes.size
     parcels = kernels.make_parcels(1, cells, scattered=math.isfinite(given.strength.scatter))
     parcels.sizes[0, 1:-1], parcels.streams[0, 1:-1] = sizes, streams
-    if parcels.weakness.size:
+    if parcels.weakness is not None:
         parcels.weakness[0, 1:-1] = weakness(given.strength, streams)
-    snapshots = (1, log_stress.size, cells) if every else (0, 0, 0)
-    classes = (1, log_stress.size, len(sieves) + 1) if every and len(sieves) else (0, 0, 0)
-    record = kernels.make_record(sieves, snapshots, classes)
+    record = Record(snapshots=np.empty((1, log_stress.size, cells), np.float32)) if every else Record()
+    if len(sieves):
+        counts = np.empty((1, 1 + log_stress.size, len(sieves) + 1), np.int64)
+        record = record._replace(sieves=np.array(sieves, float), counts=counts[:, 0], classes=counts[:, 1:])
     path = Path(log_stress[None], given.strength.critical_size_ratio(log_stress)[None])
     passage = Passage(*np.array([[0], [0], [0], [log_stress.size]]))
     kernel(parcels, passage, path, ore(given), kernels.make_work(cells), record)
     found = parcels.sizes[0, 1:-1], parcels.streams[0, 1:-1], int(parcels.breaks[0])
-    kept = record.snapshots.reshape(-1, cells), record.classes.reshape(-1, len(sieves) + 1)
-    return (*found, *kept) if every else found
+    return (*found, record.snapshots[0], None if record.classes is None else record.classes[0]) if every else found
 
 
 def weakness(strength, streams):
@@ -157,9 +157,9 @@ def crush(scene, stress, seed=0, replicate=0):
 
 def draw(feed, cells, source):
     """Sizes of a parcel as the package draws them, from a SeedSequence."""
-    uniforms, nothing = np.empty((1, cells)), np.empty((1, 0), np.float32)
+    uniforms = np.empty((1, cells))
     bases = source.generate_state(2, np.uint64)[None]
-    kernels.start_parcels(bases, ore(laws()), uniforms, np.empty((1, cells + 2), np.uint64), nothing)
+    kernels.start_parcels(bases, ore(laws()), uniforms, np.empty((1, cells + 2), np.uint64), None)
     return feed.quantile(uniforms[0]).astype(np.float32)
 
 

@@ -57,7 +57,7 @@ class Ore(NamedTuple):
     reference_size: float  # m
     scatter: float  # k
     fragments: int  # tag
-    inverse_exponent: float  # 1 / gamma
+    inverse_exponent: float | None  # 1 / gamma; None where fragments are uniform
     size_exponent: float  # nu
     parent_size: float  # s_r, m
     size_floor: float  # m
@@ -68,8 +68,8 @@ class Parcels(NamedTuple):
 
     sizes: np.ndarray  # float32 (slot, cell + 2), m
     streams: np.ndarray  # uint64 (slot, cell + 2), state of the random stream of each place
-    weakness: np.ndarray  # float32 (slot, cell + 2), by which a grain's own strength multiplies its effective size,
-    # or (slot, 0) where strengths do not scatter
+    weakness: np.ndarray | None  # float32 (slot, cell + 2), by which a grain's own strength multiplies its effective
+    # size; None where strengths do not scatter
     unshielded: np.ndarray  # float32 (slot, cell + 2), bounds of cells that nothing is known of but themselves
     bounds: np.ndarray  # float32 (slot, block x BLOCK + 2), upper bounds of effective size over s_m
     block_bounds: np.ndarray  # float32 (slot, block, to the next BLOCK), the largest in each block
@@ -94,12 +94,12 @@ class Passage(NamedTuple):
 
 
 class Record(NamedTuple):
-    """What is kept of every point of a passage; empty arrays keep nothing."""
+    """What is kept of every point of a passage; None keeps nothing."""
 
-    sieves: np.ndarray  # float64 (sieve,), m
-    counts: np.ndarray  # int64 (sieve + 1,), work space
-    snapshots: np.ndarray  # float32 (parcel, point, cell), sizes, m
-    classes: np.ndarray  # int64 (parcel, point, sieve + 1), cells of each sieve class
+    sieves: np.ndarray | None = None  # float64 (sieve,), m
+    counts: np.ndarray | None = None  # int64 (parcel, sieve + 1), of the point each is at
+    classes: np.ndarray | None = None  # int64 (parcel, point, sieve + 1), cells of each sieve class
+    snapshots: np.ndarray | None = None  # float32 (parcel, point, cell), sizes, m
 
 
 class Work(NamedTuple):
@@ -134,7 +134,7 @@ def make_parcels(count: int, cells: int, scattered: bool) -> Parcels:
     return Parcels(
         np.zeros((count, cells + 2), np.float32),
         np.zeros((count, cells + 2), np.uint64),
-        np.empty((count, cells + 2 if scattered else 0), np.float32),
+        np.empty((count, cells + 2), np.float32) if scattered else None,
         np.empty((count, cells + 2), np.float32),
         np.empty((count, blocks * BLOCK + 2), np.float32),
         np.empty((count, -(-blocks // BLOCK) * BLOCK), np.float32),
@@ -153,13 +153,6 @@ def make_work(cells: int) -> Work:
     return Work(
         *lists, sizes, bits[0], totals, ratios, bits[1], np.empty(most, np.uint64), np.empty(most, np.float32), *answers
     )
-
-
-def make_record(sieves=(), snapshots=(0, 0, 0), classes=(0, 0, 0)) -> Record:
-    """Return arrays of these shapes for what is to be kept."""
-    sieves = np.array(sieves, float)
-    counts = np.empty(sieves.size + 1, np.int64)
-    return Record(sieves, counts, np.empty(snapshots, np.float32), np.empty(classes, np.int64))
 
 
 # --- vectors ------------------------------------------------------------------------------------------------
@@ -283,7 +276,7 @@ def start_parcels(bases, ore, uniforms, streams, weakness):
     for k in range(bases.shape[0]):
         for p in range(1, cells + 1):
             streams[k, p] = mix(bases[k, 0] + np.uint64(p) * _GOLDEN)
-        if weakness.shape[1] > 0:
+        if weakness is not None:
             for p in range(1, cells + 1):
                 weakness[k, p] = _weakness(streams[k, p], ore)
         state = bases[k, 1]
@@ -331,60 +324,58 @@ def sieve_class(sieves, size):
 
 
 @_inner
-def _count(sizes, places, found, sieves, step, counts):
-    """Add `step` to the sieve class (sieve + 1) of each of the first `found` places."""
-    for k in range(found):
-        counts[sieve_class(sieves, sizes[places[k]])] += step
+def _count(sizes, places, found, sieves, k, step, counts):
+    """Add `step` to the sieve class of parcel k, counts (parcel, sieve + 1), of each of the first `found` places."""
+    if sieves is not None:
+        for n in range(found):
+            counts[k, sieve_class(sieves, sizes[places[n]])] += step
 
 
 @_compiled
-def classify(sizes, slot, sieves, counts):
-    """Count the cells of each sieve class in the parcel of a slot into `counts` (sieve + 1)."""
-    for m in range(counts.size):
-        counts[m] = 0
-    for p in range(1, sizes.shape[1] - 1):
-        counts[sieve_class(sieves, sizes[slot, p])] += 1
+def classify(sizes, slot, sieves, k, counts):
+    """Count the cells of each sieve class in the parcel of a slot into `counts` (parcel, sieve + 1) of parcel k."""
+    if sieves is not None:
+        for m in range(counts.shape[1]):
+            counts[k, m] = 0
+        for p in range(1, sizes.shape[1] - 1):
+            counts[k, sieve_class(sieves, sizes[slot, p])] += 1
 
 
 # --- crushing -----------------------------------------------------------------------------------------------
 
 
-# Powers in plain arithmetic, which unlike calls becomes vectors (40 -> 3 ns a value) and has the same bits everywhere,
-# to about 1e-13: `_split`, `_exponentiate` and `_join` make v^e = 2^(e log2 v) of values v > 0, one loop each.
-
-
 @_inlined
-def _split(count, bits, powers):
-    """Split numbers, given by their bits, into mantissas between sqrt(1/2) and sqrt(2) and powers of 2."""
-    for k in range(count):
-        power = (bits[k] - np.int64(0x3FE6A09E667F3BCD)) >> np.int64(52)
-        bits[k] -= power << np.int64(52)
-        powers[k] = power
+def _raise(exponent, count, values, bits, exponents, powers, power_bits):
+    """Raise numbers v > 0 to their exponents, v^e = 2^(e log2 v), where there are any.
 
-
-@_inlined
-def _exponentiate(count, values, exponents, powers):
-    """Raise split numbers: log2 by artanh of the mantissa, 2^r by its series up to r = 1/2."""
-    for k in range(count):
-        z = (values[k] - 1.0) / (values[k] + 1.0)
-        y = z * z
-        series = 2 / 9 + y * (2 / 11 + y * (2 / 13 + y * (2 / 15 + y * (2 / 17 + y * (2 / 19)))))
-        logarithm = z * (2.0 + y * (2 / 3 + y * (2 / 5 + y * (2 / 7 + y * series))))
-        exponent = (np.float64(powers[k]) + logarithm * 1.4426950408889634) * exponents[k]
-        exponent = min(max(exponent, -1000.0), 100.0)
-        whole = np.floor(exponent + 0.5)
-        r = (exponent - whole) * 0.6931471805599453
-        series = 1 / 5040 + r * (1 / 40320 + r * (1 / 362880 + r * (1 / 3628800 + r * (1 / 39916800))))
-        series = 1.0 + r * (0.5 + r * (1 / 6 + r * (1 / 24 + r * (1 / 120 + r * (1 / 720 + r * series)))))
-        values[k] = 1.0 + r * series
-        powers[k] = (np.int64(whole) + np.int64(1023)) << np.int64(52)
-
-
-@_inlined
-def _join(count, values, powers):
-    """Multiply mantissas by powers of 2."""
-    for k in range(count):
-        values[k] *= powers[k]
+    `bits` and `power_bits` are the bits of `values` and of the work space `powers`. In plain arithmetic, which unlike
+    calls becomes vectors (40 -> 3 ns a value), to about 1e-13; series in pairs of terms, for a step raises few numbers
+    and would wait for a sum of one term after the other.
+    """
+    if exponent is not None:
+        for k in range(count):  # mantissa between sqrt(1/2) and sqrt(2), power of 2
+            power = (bits[k] - np.int64(0x3FE6A09E667F3BCD)) >> np.int64(52)
+            bits[k] -= power << np.int64(52)
+            power_bits[k] = power
+        for k in range(count):
+            z = (values[k] - 1.0) / (values[k] + 1.0)
+            y = z * z
+            y2 = y * y
+            y4 = y2 * y2
+            first, second = 2.0 + y * (2 / 3) + y2 * (2 / 5 + y * (2 / 7)), 2 / 9 + y * (2 / 11)
+            logarithm = z * (first + y4 * (second + y2 * (2 / 13 + y * (2 / 15)) + y4 * (2 / 17 + y * (2 / 19))))
+            power = (np.float64(power_bits[k]) + logarithm * 1.4426950408889634) * exponents[k]
+            power = min(max(power, -1000.0), 100.0)
+            whole = np.floor(power + 0.5)
+            r = (power - whole) * 0.6931471805599453
+            r2 = r * r
+            r4 = r2 * r2
+            first, second = 1.0 + r + r2 * (0.5 + r * (1 / 6)), 1 / 24 + r * (1 / 120) + r2 * (1 / 720 + r * (1 / 5040))
+            third = 1 / 40320 + r * (1 / 362880) + r2 * (1 / 3628800 + r * (1 / 39916800))
+            values[k] = first + r4 * (second + r4 * third)
+            power_bits[k] = (np.int64(whole) + np.int64(1023)) << np.int64(52)
+        for k in range(count):
+            values[k] *= powers[k]
 
 
 @_inlined
@@ -407,7 +398,7 @@ def _close(line):
 
 
 @_inner
-def _set_bounds(sizes, weakness, unshielded, bounds, block_bounds, ore):
+def _set_bounds(sizes, weakness, slot, unshielded, bounds, block_bounds, ore):
     """Set the bounds of a line of cells whose neighbourhoods are all new."""
     cells = sizes.size - 2
     bound_per_size, size_floor = _bound_per_size(ore), ore.size_floor
@@ -415,9 +406,9 @@ def _set_bounds(sizes, weakness, unshielded, bounds, block_bounds, ore):
     unshielded[0] = unshielded[cells + 1] = _NEVER
     for p in range(1, cells + 1):
         unshielded[p] = _unshielded(np.float64(sizes[p]), bound_per_size, size_floor)
-    if weakness.size:
+    if weakness is not None:
         for p in range(1, cells + 1):
-            unshielded[p] *= weakness[p]
+            unshielded[p] *= weakness[slot, p]
     for p in range(bounds.size):
         bounds[p] = unshielded[p] if p <= cells else _NEVER
     for block in range(block_bounds.size):
@@ -444,7 +435,7 @@ def _list_candidates(needed, bounds, active, actives, places):
 
 
 @_inlined
-def _gather(sizes, weakness, places, candidates, ore, found, totals, ratios):
+def _gather(sizes, weakness, slot, places, candidates, ore, found, totals, ratios):
     """Fill sizes found, their sums with both neighbours, and effective sizes over s_m without neighbours."""
     inverse_size = 1.0 / ore.reference_size if ore.slope > 0.0 else 0.0
     for k in range(candidates):
@@ -454,9 +445,9 @@ def _gather(sizes, weakness, places, candidates, ore, found, totals, ratios):
         totals[k] = (np.float64(sizes[p - _1]) + np.float64(sizes[p + _1])) + size
         found[k] = size
         ratios[k] = size * inverse_size if inverse_size > 0.0 else 1.0
-    if weakness.size:
+    if weakness is not None:
         for k in range(candidates):
-            ratios[k] *= np.float64(weakness[np.uint64(places[k])])
+            ratios[k] *= np.float64(weakness[slot, np.uint64(places[k])])
 
 
 @_inlined
@@ -489,14 +480,14 @@ def _decide(count, sizes, totals, ratios, cushion, critical_ratio, bounds, break
 
 
 @_inner
-def _decide_by_logarithms(candidates, sizes, totals, weakness, places, ore, log_stress, bounds, breaks, unsure):
+def _decide_by_logarithms(count, sizes, totals, weakness, slot, places, ore, log_stress, bounds, breaks, unsure):
     """Decide the breaks that are unsure."""
-    for k in range(candidates):
+    for k in range(count):
         if unsure[k]:
             unlike = math.log(sizes[k] / (totals[k] / 3.0))
             strength = ore.cushion * unlike * unlike - ore.slope * math.log(sizes[k] / ore.reference_size)
-            if weakness.size:
-                strength -= _scale(ore) * math.log(weakness[places[k]])
+            if weakness is not None:
+                strength -= _scale(ore) * math.log(weakness[slot, places[k]])
             breaks[k] = log_stress >= strength
             bounds[k] = np.float32(math.exp(-strength / _scale(ore)) * _MARGIN)
 
@@ -526,23 +517,35 @@ def _draw(streams, places, found, states, ratios):
 
 
 @_inlined
-def _exponents(sizes, places, found, ore, exponents):
-    """Fill the exponents 1 / gamma(s) of the parents' fragment ratios, to the end of the last vector."""
-    for k in range(found + BLOCK):
-        exponents[k] = ore.inverse_exponent
-    if ore.size_exponent != 0.0:
-        for k in range(found):
-            power = (np.float64(sizes[places[k]]) / ore.parent_size) ** ore.size_exponent
-            exponents[k] = min(max(ore.inverse_exponent / power, 1.0 / HELD[1]), 1.0 / HELD[0])
+def _exponent_of(exponent, size, ore):
+    """Return the exponent 1 / gamma(s) of the fragment ratios of a parent of size s, m."""
+    power = (np.float64(size) / ore.parent_size) ** ore.size_exponent
+    return min(max(exponent / power, 1.0 / HELD[1]), 1.0 / HELD[0])
 
 
 @_inlined
-def _settle_powers(sizes, streams, places, found, ratios, exponents):
+def _exponents(exponent, sizes, places, found, whole, ore, exponents):
+    """Fill the exponents of the parents' fragment ratios, to the end of the last vector."""
+    if exponent is not None:
+        for k in range(whole):
+            exponents[k] = exponent
+        if ore.size_exponent != 0.0:
+            for k in range(found):
+                exponents[k] = _exponent_of(exponent, sizes[places[k]], ore)
+
+
+@_inlined
+def _settle_powers(exponent, sizes, streams, places, found, ratios, exponents):
     """Take the library's power, which the bits are defined by, where ours may give another float32: next to a half."""
-    for k in range(found):
-        p = np.uint64(places[k])
-        if np.float32(sizes[p] * (ratios[k] * (1.0 - 1e-12))) != np.float32(sizes[p] * (ratios[k] * (1.0 + 1e-12))):
-            ratios[k] = uniform(streams[p]) ** exponents[k]
+    if exponent is not None:
+        doubts = np.int64(0)
+        for k in range(found):
+            size, ratio = sizes[np.uint64(places[k])], ratios[k]
+            doubts += np.float32(size * (ratio * (1.0 - 1e-12))) != np.float32(size * (ratio * (1.0 + 1e-12)))
+        for k in range(found if doubts else 0):
+            p = np.uint64(places[k])
+            if np.float32(sizes[p] * (ratios[k] * (1.0 - 1e-12))) != np.float32(sizes[p] * (ratios[k] * (1.0 + 1e-12))):
+                ratios[k] = uniform(streams[p]) ** exponents[k]
 
 
 @_inlined
@@ -558,12 +561,24 @@ def _break(sizes, unshielded, places, found, ore, ratios):
 
 
 @_inner
-def _draw_strength(streams, weakness, unshielded, places, found, ore):
+def _draw_strength(streams, weakness, slot, unshielded, places, found, ore):
     """Draw the strength of each fragment."""
-    for k in range(found):
-        p = np.uint64(places[k])
-        weakness[p] = _weakness(streams[p], ore)
-        unshielded[p] *= weakness[p]
+    if weakness is not None:
+        for k in range(found):
+            p = np.uint64(places[k])
+            weakness[slot, p] = _weakness(streams[p], ore)
+            unshielded[p] *= weakness[slot, p]
+
+
+@_inner
+def _keep(sizes, counts, k, j, snapshots, classes):
+    """Keep the sizes and the counts of sieve classes of parcel k at point j."""
+    if snapshots is not None:
+        for p in range(snapshots.shape[2]):
+            snapshots[k, j, p] = sizes[p + 1]
+    if classes is not None:
+        for m in range(classes.shape[2]):
+            classes[k, j, m] = counts[k, m]
 
 
 @_inlined
@@ -612,61 +627,75 @@ def crush(parcels, passage, path, ore, work, record):
     """
     active, places, chosen, bits, totals, ratios, ratio_bits, states, tight, breaking, unsure = work
     log_stress, critical_ratio = path
-    sieves, counts, snapshots, classes = record
+    sieves, counts = record.sieves, record.counts
     cells, cushion = parcels.sizes.shape[1] - 2, ore.cushion / _scale(ore)
-    powers = ore.fragments == POWER_LAW and (ore.inverse_exponent != 1.0 or ore.size_exponent != 0.0)
     for k in range(passage.slots.size):
         slot, line = passage.slots[k], passage.lines[k]
-        sizes, streams, weakness = parcels.sizes[slot], parcels.streams[slot], parcels.weakness[slot]
+        sizes, streams = parcels.sizes[slot], parcels.streams[slot]
         unshielded, bounds, block_bounds = parcels.unshielded[slot], parcels.bounds[slot], parcels.block_bounds[slot]
-        if sieves.size:
-            classify(parcels.sizes, slot, sieves, counts)
+        classify(parcels.sizes, slot, sieves, k, counts)
         for j in range(passage.first[k], passage.last[k]):
             critical = critical_ratio[line, j]
             if critical < np.inf:
                 if parcels.bounds_outdated[slot]:
-                    _set_bounds(sizes, weakness, unshielded, bounds, block_bounds, ore)
+                    _set_bounds(sizes, parcels.weakness, slot, unshielded, bounds, block_bounds, ore)
                     parcels.bounds_outdated[slot] = False
                 needed = np.float32(min(critical, 3e38))  # float32 ends there, beyond every effective size
                 actives = _list_blocks(needed, block_bounds, active)
                 count = _list_candidates(needed, bounds, active, actives, places)
-                _gather(sizes, weakness, places, count, ore, chosen, totals, ratios)
+                _gather(sizes, parcels.weakness, slot, places, count, ore, chosen, totals, ratios)
                 if ore.strength == SIZE_EFFECT:
                     # in whole vectors; what is decided beyond the last candidate is not read
                     whole = (count + BLOCK - 1) // BLOCK * BLOCK
                     if _decide(whole, chosen, totals, ratios, cushion, critical, tight, breaking, unsure):
-                        level = log_stress[line, j]
+                        level, weak = log_stress[line, j], parcels.weakness
                         _decide_by_logarithms(
-                            count, chosen, totals, weakness, places, ore, level, tight, breaking, unsure
+                            count, chosen, totals, weak, slot, places, ore, level, tight, breaking, unsure
                         )
                 found = _list_breaks(count, tight, breaking, bounds, places)
-                if sieves.size:
-                    _count(sizes, places, found, sieves, -1, counts)
+                _count(sizes, places, found, sieves, k, -1, counts)
                 _draw(streams, places, found, states, chosen)
-                if powers:
-                    whole = (found + BLOCK - 1) // BLOCK * BLOCK
-                    _exponents(sizes, places, found, ore, totals)
-                    _split(whole, bits, ratio_bits)
-                    _exponentiate(whole, chosen, totals, ratio_bits)
-                    _join(whole, chosen, ratios)
-                    _settle_powers(sizes, streams, places, found, chosen, totals)
+                if found and ore.fragments == POWER_LAW:
+                    whole, exponent = (found + BLOCK - 1) // BLOCK * BLOCK, ore.inverse_exponent
+                    _exponents(exponent, sizes, places, found, whole, ore, totals)
+                    _raise(exponent, whole, chosen, bits, totals, ratios, ratio_bits)
+                    _settle_powers(exponent, sizes, streams, places, found, chosen, totals)
                 _break(sizes, unshielded, places, found, ore, chosen)
-                if weakness.size:
-                    _draw_strength(streams, weakness, unshielded, places, found, ore)
-                if sieves.size:
-                    _count(sizes, places, found, sieves, 1, counts)
+                _draw_strength(streams, parcels.weakness, slot, unshielded, places, found, ore)
+                _count(sizes, places, found, sieves, k, 1, counts)
                 _renew(unshielded, bounds, places, found)
                 if found:
                     _renew_ends(unshielded, bounds, places[0], places[found - 1])
                 _renew_blocks(bounds, block_bounds, active, actives)
                 _renew_seams(bounds, block_bounds, active, actives, cells)
                 parcels.breaks[slot] += found
-            if snapshots.size:
-                for p in range(cells):
-                    snapshots[k, j, p] = sizes[p + 1]
-            if classes.size:
-                for m in range(counts.size):
-                    classes[k, j, m] = counts[m]
+            _keep(sizes, counts, k, j, record.snapshots, record.classes)
+
+
+@_compiled
+def complete(sizes, streams, weakness, critical_ratios, exponent, ore):
+    """Break cells (slot, cell + 2) on, without cushioning, until each is below its parcel's critical ratio, (slot,).
+
+    Cushioning only strengthens, and a cell's fragments draw the numbers of its own stream in order. So what broke
+    before would have broken without cushioning too, into the same fragments: what is left are the breaks that it held,
+    3 % of all in the paper's scene.
+    """
+    inverse_size = 1.0 / ore.reference_size
+    for k in range(critical_ratios.size):
+        critical = critical_ratios[k]
+        for p in range(1, sizes.shape[1] - 1):
+            size, weak = sizes[k, p], 1.0
+            if weakness is not None:
+                weak = np.float64(weakness[k, p])
+            while size * inverse_size * weak >= critical and size >= ore.size_floor:
+                streams[k, p] += _GOLDEN
+                ratio = uniform(streams[k, p])
+                if exponent is not None:
+                    ratio **= exponent if ore.size_exponent == 0.0 else _exponent_of(exponent, size, ore)
+                size = np.float32(max(size * ratio, SMALLEST))
+                if weakness is not None:
+                    weak = np.float64(_weakness(streams[k, p], ore))
+            sizes[k, p] = size
 
 
 # --- exchange -----------------------------------------------------------------------------------------------
@@ -741,11 +770,12 @@ def _swap_densely(sizes, lower, upper, first, last, drive, halves, hits):
 
 @_inlined
 def _follow(values, lower, upper, first, last, hits):
-    """Swap what belongs to the cells that have swapped."""
-    for k in range(last - first):
-        p = np.uint64(first + k)
-        a, b = values[lower, p], values[upper, p]
-        values[lower, p], values[upper, p] = b if hits[k] else a, a if hits[k] else b
+    """Swap what belongs to the cells that have swapped, if anything does."""
+    if values is not None:
+        for k in range(last - first):
+            p = np.uint64(first + k)
+            a, b = values[lower, p], values[upper, p]
+            values[lower, p], values[upper, p] = b if hits[k] else a, a if hits[k] else b
 
 
 @_inner
@@ -768,7 +798,7 @@ def _swap_sparsely(sizes, weakness, lower, upper, first, last, state, drive, mos
         state += _GOLDEN
         if uniform(state) * most < _chance(a, b, drive):
             sizes[lower, p], sizes[upper, p] = b, a
-            if weakness.shape[1] > 0:
+            if weakness is not None:
                 weakness[lower, p], weakness[upper, p] = weakness[upper, p], weakness[lower, p]
             swaps += 1
         state += _GOLDEN
@@ -817,8 +847,7 @@ def swap(parcels, slots, edges, means, largest, key, first, last, numbers, halve
         if most > DENSE:
             _fill_numbers(numbers, state)
             swaps = np.int64(_swap_densely(sizes, lower, upper, first, last, drive, halves, hits))
-            if weakness.shape[1] > 0:
-                _follow(weakness, lower, upper, first, last, hits)
+            _follow(weakness, lower, upper, first, last, hits)
         else:
             swaps = np.int64(_swap_sparsely(sizes, weakness, lower, upper, first, last, state, drive, most))
         if swaps > 0:

@@ -14,7 +14,7 @@ import numpy as np
 
 from hpgr.bed.loaded import LoadedBed
 from hpgr.grains import kernels, march
-from hpgr.grains.kernels import Edges, Passage
+from hpgr.grains.kernels import Edges, Passage, Record
 from hpgr.grains.march import Cells
 from hpgr.scene import Scene
 
@@ -194,7 +194,6 @@ class Lattice:
         cells, scattered = scene.resolution.cells, math.isfinite(scene.strength.scatter)
         self.parcels = kernels.make_parcels(log_stress.size, cells, scattered)
         self._works = [kernels.make_work(cells) for _ in range(os.cpu_count() or 1)]
-        self._nothing = kernels.make_record()
         self._home = np.arange(log_stress.size).reshape(log_stress.shape)
         self.slots = self._home
         self._entering = entering
@@ -217,10 +216,10 @@ class Lattice:
 
     def classes(self, sieves: np.ndarray) -> np.ndarray:
         """Return the cells of each sieve class, (streamline, point, sieve + 1)."""
-        counts = np.empty((*self.slots.shape, sieves.size + 1), np.int64)
-        for place, slot in np.ndenumerate(self.slots):
-            kernels.classify(self.parcels.sizes, slot, sieves, counts[place])
-        return counts
+        counts = np.empty((self.slots.size, sieves.size + 1), np.int64)
+        for place, slot in enumerate(self.slots.ravel()):
+            kernels.classify(self.parcels.sizes, slot, sieves, place, counts)
+        return counts.reshape(*self.slots.shape, -1)
 
     def _crush(self, slots: np.ndarray, lines: np.ndarray, first: np.ndarray, last: np.ndarray) -> None:
         """Crush parcels at their points from `first` to before `last`, shared between the cores."""
@@ -228,7 +227,7 @@ class Lattice:
 
         def crush(work, part):
             passage = Passage(*(np.ascontiguousarray(each[part]) for each in (slots, lines, first, last)))
-            kernels.crush(self.parcels, passage, self._path, self._ore, work, self._nothing)
+            kernels.crush(self.parcels, passage, self._path, self._ore, work, Record())
 
         list(self._each(crush, self._works, parts))
 
@@ -238,7 +237,8 @@ class Lattice:
             keys = [self._key(line, step - point) for line in range(slots.size)]
             fresh = march.first_cells(self._scene, self._seed, keys, self._entering)
             for mine, new in zip(self.parcels, fresh, strict=True):
-                mine[slots] = new
+                if mine is not None:
+                    mine[slots] = new
         if step == 0 and self._scene.exchange.start == "crushed":
             lines, points = np.divmod(np.arange(self.slots.size), self.slots.shape[1])
             self._crush(self.slots.ravel(), lines, 0 * points, points)

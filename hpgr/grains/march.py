@@ -11,12 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from hpgr.grains import kernels
-from hpgr.grains.kernels import Ore, Parcels, Passage, Path
+from hpgr.grains.kernels import Ore, Parcels, Passage, Path, Record
 from hpgr.laws.roll_width import Slices
 from hpgr.scene import Scene
 
 _LARGE = 200_000  # cells of all parcels from which they are crushed on all cores
-_STEPS = 32  # of complete crushing in a call of the kernel; nothing is left after the first nearly always
 
 
 class Cells(NamedTuple):
@@ -86,23 +85,6 @@ def cores(cells: int) -> Iterator[Callable]:
         yield map
 
 
-def _complete(scene: Scene, parcels: Parcels, lines: np.ndarray, log_stress: np.ndarray) -> None:
-    """Crush parcels on to what they come to without cushioning at the highest stress of their lines.
-
-    Cushioning only strengthens, and a cell's fragments draw the numbers of its own stream in order. So what broke would
-    have broken without cushioning too, into the same fragments: only breaks that it held are missing (3 % of them in
-    the paper's scene).
-    """
-    loads = path(scene, np.repeat(log_stress.max(axis=1, keepdims=True), _STEPS, axis=1))
-    slots = np.arange(lines.size)
-    steps = Passage(slots, lines, 0 * slots, 0 * slots + _STEPS)
-    laws, work = ore(scene)._replace(cushion=0.0), kernels.make_work(scene.resolution.cells)
-    parcels.bounds_outdated[:], before = True, -1
-    while parcels.breaks.sum() > before:
-        before = parcels.breaks.sum()
-        kernels.crush(parcels, steps, loads, laws, work, kernels.make_record())
-
-
 def march(
     scene: Scene,
     log_stress: np.ndarray,
@@ -139,30 +121,31 @@ def march(
     lines, breaks = np.array([line for *_, line in columns]), np.empty(len(columns), np.int64)
     product = np.empty((len(columns), grid.cells), np.float32)
     ends = np.empty_like(product) if complete else None
-    kept = {
-        "cells": {"snapshots": (len(columns), points, grid.cells)},
-        "distributions": {"sieves": cell_sieves(scene), "classes": (len(columns), points, len(grid.sieves) + 1)},
-    }
-    record = kernels.make_record(**kept.get(grid.record, {}))
+    record = Record()
+    if grid.record == "cells":
+        record = Record(snapshots=np.empty((len(columns), points, grid.cells), np.float32))
+    if grid.record == "distributions":
+        sieves = cell_sieves(scene)
+        kept = np.empty((len(columns), points, sieves.size + 1), np.int64)
+        record = Record(sieves, np.empty((len(columns), sieves.size + 1), np.int64), kept)
 
     def crush(part: slice) -> None:
         parcels = first_cells(scene, seed, keys[part])
         slots = np.arange(parcels.breaks.size)
         passage = Passage(slots, lines[part], 0 * slots, 0 * slots + points)
-        own = record._replace(
-            counts=record.counts.copy(), snapshots=record.snapshots[part], classes=record.classes[part]
-        )
+        own = Record(record.sieves, *(None if kept is None else kept[part] for kept in record[1:]))
         kernels.crush(parcels, passage, loads, ore(scene), kernels.make_work(grid.cells), own)
         product[part], breaks[part] = parcels.sizes[:, 1:-1], parcels.breaks
         if ends is not None:
-            _complete(scene, parcels, lines[part], loads.log_stress)
+            critical, laws = loads.critical_ratio.min(axis=1)[lines[part]], ore(scene)
+            kernels.complete(*parcels[:3], critical, laws.inverse_exponent, laws)
             ends[part] = parcels.sizes[:, 1:-1]
 
     large = product.size >= _LARGE
     with cores(product.size) as each:
         list(each(crush, [slice(k, k + 1) for k in range(len(columns))] if large else [slice(None)]))
-    found = product, breaks, record.snapshots, record.classes, np.empty(0) if ends is None else ends
+    found = product, breaks, record.snapshots, record.classes, ends
     shape = (len(replicates), grid.snapshots, -1)
-    parts = [part.reshape(*shape, *part.shape[1:]) if part.size else [None] * len(replicates) for part in found]
+    parts = [[None] * len(replicates) if part is None else part.reshape(*shape, *part.shape[1:]) for part in found]
     for cells, broken, *kept in zip(*parts, strict=True):
         yield Cells(cells, broken.sum(axis=0), *kept)

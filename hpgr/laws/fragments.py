@@ -14,7 +14,7 @@ class FragmentConstants(NamedTuple):
     """A law as the kernels take it."""
 
     fragments: int
-    inverse_exponent: float  # 1 / gamma
+    inverse_exponent: float | None  # 1 / gamma; None where fragments are uniform
     size_exponent: float  # nu
     parent_size: float  # s_r, m
     size_floor: float  # m
@@ -63,7 +63,8 @@ class PowerLawFragments(Frozen):
 
     def constants(self) -> FragmentConstants:
         """Return the law as the kernels take it."""
-        return FragmentConstants(POWER_LAW, 1 / self.exponent, self.size_exponent, self.reference_size, self.size_floor)
+        inverse = None if self.exponent == 1 and self.size_exponent == 0 else 1 / self.exponent
+        return FragmentConstants(POWER_LAW, inverse, self.size_exponent, self.reference_size, self.size_floor)
 
 
 Fragments = PowerLawFragments
