@@ -38,6 +38,9 @@ def lattice(scene, seed=0, replicate=0, steady=None):
     return Lattice(scene, loads(scene), rooms.swap_rates(scene, bed), seed, replicate, steady or {})
 
 
+PLAIN = {"resolution.control_variate": False}  # which the lattice has not
+
+
 # --- only what a scene requires ----------------------------------------------------------------------------
 
 
@@ -45,7 +48,7 @@ def lattice(scene, seed=0, replicate=0, steady=None):
 @pytest.mark.parametrize("cells", [1, 16, 37])
 def test_exchange_of_zero_is_the_march_bit_for_bit(n, cells):
     """A = B = 0: every snapshot's parcel has the key it has without exchange. All snapshots, any interval."""
-    still = small({"strength.cushioning": n, "resolution.cells": cells, "resolution.snapshots": 3})
+    still = small(PLAIN | {"strength.cushioning": n, "resolution.cells": cells, "resolution.snapshots": 3})
     wanted = simulate(still, seed=5, replicate=1)
     assert float(wanted["breaks_per_cell"].min()) > 0.5
     for interval in (1, 7, 40):
@@ -61,7 +64,7 @@ def test_exchange_of_zero_is_the_march_bit_for_bit(n, cells):
 
 @pytest.mark.parametrize("n", [1.0, INF])
 def test_exchange_of_zero_records_the_distributions_of_the_march(n, monkeypatch):
-    still = small({"strength.cushioning": n, "resolution.record": "distributions", "resolution.snapshots": 2})
+    still = small(PLAIN | {"strength.cushioning": n, "resolution.record": "distributions", "resolution.snapshots": 2})
     found = simulate(still.with_values(MARCH_ONLY), seed=6)
     monkeypatch.setattr(solve, "choose", lambda scene: "march")  # n = inf: not the closed form
     wanted = simulate(still, seed=6)
@@ -72,7 +75,7 @@ def test_exchange_of_zero_records_the_distributions_of_the_march(n, monkeypatch)
 
 @pytest.mark.parametrize("values", [{"exchange.start": "crushed"}, {"exchange.record_startup": True}])
 def test_start_and_start_up_do_not_touch_the_steady_product(values):
-    still = small({"resolution.snapshots": 2})
+    still = small(PLAIN | {"resolution.snapshots": 2})
     wanted = simulate(still, seed=7)
     found = simulate(still.with_values(MARCH_ONLY | {"exchange.interval": 5} | values), seed=7)
     for name in PRODUCT:
