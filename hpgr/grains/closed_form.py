@@ -98,7 +98,7 @@ def crushed_passing(feed: Feed, size, critical, gamma: float) -> np.ndarray:
     >>> closed_form.crushed_passing(SingleFeed(size="50 mm"), [1e-3, 4e-3, 8e-3], 8e-3, gamma=1)
     array([0.125, 0.5  , 1.   ])
     """
-    size, critical = np.broadcast_arrays(np.asarray(size, dtype=float), np.asarray(critical, dtype=float))
+    size, critical = np.asarray(size, dtype=float), np.asarray(critical, dtype=float)
     crushed = (1 - feed.passing(critical)) * np.minimum(size / critical, 1.0) ** gamma  # 0 where s_c is inf
     return np.where(size < critical, feed.passing(size) + crushed, 1.0)
 

@@ -295,19 +295,82 @@ def start_parcels(bases, ore, uniforms, streams, weakness):
 
 
 @_compiled
-def passing_counts(rows, sieves, counts):
-    """Fill counts (row, sieve) with the cells of each sorted row that are no larger than each sieve."""
+def passing_counts(rows, sizes, counts):
+    """Fill counts (row, size) with the cells of each sorted row that are no larger than sizes (size, row or 1)."""
     for k in range(rows.shape[0]):
-        row = rows[k]
-        for m in range(sieves.size):
-            low, high = 0, row.size
+        own = k if sizes.shape[1] > 1 else 0
+        for m in range(sizes.shape[0]):
+            low, high = 0, rows.shape[1]
             while low < high:
                 middle = (low + high) // 2
-                if row[middle] <= sieves[m]:
+                if rows[k, middle] <= sizes[m, own]:
                     low = middle + 1
                 else:
                     high = middle
             counts[k, m] = low
+
+
+@_compiled
+def quantiles(rows, fractions, found):
+    """Fill quantiles (fraction, row) of sorted rows at fractions (fraction, row), linear between cells."""
+    last = rows.shape[1] - 1
+    for m in range(fractions.shape[0]):
+        for k in range(rows.shape[0]):
+            place = fractions[m, k] * last
+            before = np.int64(place)
+            after = before + 1 if before < last else last
+            low, high = np.float64(rows[k, before]), np.float64(rows[k, after])
+            found[m, k] = low + (high - low) * (place - before)
+
+
+@_compiled
+def correct_passing(counts, complete, passing, exact):
+    """Fill passing (row, sieve): the exact one (sieve, row) times counts over those of the complete product.
+
+    Where no cell of the latter passes, the ratio is that of the next coarser sieve: 0 would be too little in the mean.
+    """
+    for k in range(counts.shape[0]):
+        ratio = 0.0
+        for m in range(counts.shape[1] - 1, -1, -1):
+            if complete[k, m] > 0:
+                ratio = counts[k, m] / complete[k, m]
+            passing[k, m] = exact[m, k] * ratio
+        for m in range(1, counts.shape[1]):
+            if passing[k, m] < passing[k, m - 1]:
+                passing[k, m] = passing[k, m - 1]
+
+
+@_compiled
+def correct_fractions(counts, exact, first, share, fractions):
+    """Multiply fractions (fraction, replicate, line) by the counted over the exact passing of the complete product.
+
+    Parameters
+    ----------
+    counts, exact : float64 (slice x replicate x line, size), (size, slice x replicate x line)
+        Both passings, at sizes of which those from `first` on belong to the fractions.
+    first : int
+        See there.
+    share : float64 (slice,)
+        Of the mass; where the fractions have one line, it is all lines together.
+    fractions : float64 (fraction, replicate, line)
+        Held rising and at most 1.
+    """
+    count, replicates, lines = fractions.shape
+    each = counts.shape[0] // (share.size * replicates)
+    for r in range(replicates):
+        for n in range(lines):
+            before = 0.0
+            for f in range(count):
+                counted = known = 0.0
+                for s in range(share.size):
+                    row = (s * replicates + r) * each + n
+                    for k in range(row, row + (each if lines == 1 else 1)):
+                        counted += share[s] * counts[k, first + f]
+                        known += share[s] * exact[first + f, k]
+                at = fractions[f, r, n] * counted / known if known > 0.0 else fractions[f, r, n]
+                at = at if at < 1.0 else 1.0
+                before = at if at > before else before
+                fractions[f, r, n] = before
 
 
 @_compiled

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from hpgr.laws.roll_width import Slices
 from hpgr.scene import Scene
 
 _LARGE = 200_000  # cells of all parcels from which they are crushed on all cores
+_AT_ONCE = 20_000  # cells of the parcels of a call, whose work space then stays in cache
 
 
 class Cells(NamedTuple):
@@ -57,6 +59,12 @@ def cell_sieves(scene: Scene) -> np.ndarray:
     return np.array(scene.resolution.sieves, np.float32).astype(float)
 
 
+@lru_cache(maxsize=20_000)  # a case of a sweep has the keys of the one before, and they cost a fifth of crushing it
+def _bases(seed: int, key: tuple[int, ...]) -> tuple[int, int]:
+    first, second = np.random.SeedSequence(seed, spawn_key=key).generate_state(2, np.uint64)
+    return int(first), int(second)
+
+
 def first_cells(scene: Scene, seed: int, keys: list[tuple[int, ...]], quantile: Callable | None = None) -> Parcels:
     """Return parcels of feed, a slot for each key.
 
@@ -64,8 +72,7 @@ def first_cells(scene: Scene, seed: int, keys: list[tuple[int, ...]], quantile: 
     feed, or those given, at stratified uniforms in random cell order: one uniform in each of as many equal strata
     represents the feed with a lower variance than plain sampling.
     """
-    sources = [np.random.SeedSequence(seed, spawn_key=key) for key in keys]
-    bases = np.array([source.generate_state(2, np.uint64) for source in sources])
+    bases = np.array([_bases(seed, key) for key in keys], np.uint64)
     uniforms = np.empty((len(keys), scene.resolution.cells))
     parcels = kernels.make_parcels(*uniforms.shape, scattered=np.isfinite(scene.strength.scatter))
     kernels.start_parcels(bases, ore(scene), uniforms, parcels.streams, parcels.weakness)
@@ -141,9 +148,9 @@ def march(
             kernels.complete(*parcels[:3], critical, laws.inverse_exponent, laws)
             ends[part] = parcels.sizes[:, 1:-1]
 
-    large = product.size >= _LARGE
+    step = max(_AT_ONCE // grid.cells, 1)
     with cores(product.size) as each:
-        list(each(crush, [slice(k, k + 1) for k in range(len(columns))] if large else [slice(None)]))
+        list(each(crush, [slice(k, k + step) for k in range(0, len(columns), step)]))
     found = product, breaks, record.snapshots, record.classes, ends
     shape = (len(replicates), grid.snapshots, -1)
     parts = [[None] * len(replicates) if part is None else part.reshape(*shape, *part.shape[1:]) for part in found]

@@ -192,86 +192,79 @@ def _summarised(
     scene: Scene, replicates: list[Cells], slices: Slices, exact: Callable | None = None
 ) -> list[Crushed | None]:
     """Sum up the products, snapshots pooled; corrected by what complete crushing comes to, if that is known."""
-    floor = np.nextafter(scene.fragments.size_floor, 0.0)
     pooled = _pooled([cells.product for cells in replicates], slices)
-    passing = _passing(pooled, np.append(floor, march.cell_sieves(scene)))
-    control = None
+    whole = np.sort(pooled.reshape(*pooled.shape[:2], 1, -1), axis=-1)  # all lines as those of one
+    zones = [_zone(slices, at_edge) for at_edge in (False, True)] if scene.roll_width else []
+    read = [(pooled, slices.share), *((whole, share) for share in (slices.share, *zones))]
+    percentiles = [_quantiles(cells, share, _fractions(cells.shape[1:3])) for cells, share in read]
+    below_floor = np.nextafter(scene.fragments.size_floor, 0.0)
+    counts = _count(pooled, np.append(below_floor, march.cell_sieves(scene))[:, None])
+    passing = counts / pooled.shape[-1]
     if exact is not None:
         control = Control(_pooled([cells.complete for cells in replicates], slices), exact)
         # not what is below the floor: a limit is hit by cells, not in the mean
-        passing[..., 1:] = control.corrected(passing[..., 1:], np.array(scene.resolution.sieves))
-    combined = np.tensordot(slices.share, passing, axes=1)
-    percentiles = _percentiles(pooled, slices.share, control)
-    whole = _whole(pooled)
-    total = _percentiles(whole, slices.share, control)[..., 0]
-    zones = [_zone(slices, at_edge) for at_edge in (False, True)] if scene.roll_width else []
-    apart = [_percentiles(whole, zone, control)[..., 0] for zone in zones]
+        passing[..., 1:] = control.passing(counts[..., 1:], np.array(scene.resolution.sieves))
+        fractions = control.fractions(percentiles, [share for _, share in read])
+        percentiles = [_quantiles(*one, at) for one, at in zip(read, fractions, strict=True)]
 
     def along_width(k: int) -> AlongWidth:
         each = passing[:, k, :, 1:].mean(axis=1)
-        return AlongWidth(each, *(zone @ each for zone in zones), *(part[:, k] for part in apart))
+        return AlongWidth(each, *(zone @ each for zone in zones), *(part[:, k, 0] for part in percentiles[2:]))
 
-    return [
-        Crushed(
-            breaks=slices.share @ cells.breaks.reshape(slices.share.size, -1) / pooled.shape[-1],
-            below_floor=combined[k, :, 0],
-            passing=combined[k, :, 1:],
-            percentiles=percentiles[:, k],
-            total_percentiles=total[:, k],
+    def summed(k: int, cells: Cells) -> Crushed:
+        combined = np.tensordot(slices.share, passing[:, k], axes=1)
+        return Crushed(
+            breaks=slices.share @ (cells.breaks.reshape(slices.share.size, -1) / pooled.shape[-1]),
+            below_floor=combined[:, 0],
+            passing=combined[:, 1:],
+            percentiles=percentiles[0][:, k],
+            total_percentiles=percentiles[1][:, k, 0],
             size=cells.size,
             mass_fraction=None if cells.classes is None else cells.classes[..., :-1] / scene.resolution.cells,
             along_width=along_width(k) if zones else None,
         )
-        for k, cells in enumerate(replicates)
-    ]
+
+    return [summed(k, cells) for k, cells in enumerate(replicates)]
 
 
 def _pooled(products: list[np.ndarray], slices: Slices) -> np.ndarray:
     """Return the cells (slice, replicate, streamline, cell) of products (snapshot, line, cell), sorted."""
     by_line = np.stack(products).transpose(2, 0, 1, 3)
     by_line = by_line.reshape(slices.share.size, -1, *by_line.shape[1:]).transpose(0, 2, 1, 3, 4)
-    return np.sort(by_line.reshape(*by_line.shape[:3], -1), axis=-1)
+    pooled = by_line.reshape(*by_line.shape[:3], -1)
+    pooled.sort(axis=-1)
+    return pooled
 
 
-def _passing(pooled: np.ndarray, sieves: np.ndarray) -> np.ndarray:
-    """Return the part of the sorted cells (..., cell) that passes each sieve, (..., sieve)."""
-    counts = np.empty((*pooled.shape[:-1], sieves.size), np.int64)
-    kernels.passing_counts(pooled.reshape(-1, pooled.shape[-1]), sieves, counts.reshape(-1, sieves.size))
-    return counts / pooled.shape[-1]
+def _count(pooled: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Return how many of the sorted cells (..., cell) are no larger than sizes (size, line or 1), (..., size)."""
+    counts = np.empty((*pooled.shape[:-1], len(sizes)), np.int64)
+    kernels.passing_counts(pooled.reshape(-1, pooled.shape[-1]), sizes, counts.reshape(-1, len(sizes)))
+    return counts
 
 
-def _whole(cells: np.ndarray) -> np.ndarray:
-    """Return the cells (slice, replicate, line, cell) of all lines as those of one, sorted."""
-    return np.sort(cells.reshape(*cells.shape[:2], 1, -1), axis=-1)
-
-
-def _percentiles(cells: np.ndarray, share: np.ndarray, control: "Control | None") -> np.ndarray:
-    """Return the percentiles (fraction, replicate, line) of sorted cells (slice, replicate, line, cell).
-
-    Each slice has its share of mass.
-    """
-    fractions = np.empty((len(FRACTIONS), *cells.shape[1:3]))
-    fractions[:] = np.array(FRACTIONS)[:, None, None]
-    found = _quantiles(cells, share, fractions)
-    return found if control is None else _quantiles(cells, share, control.to_read(found, fractions, share))
+def _fractions(shape: tuple[int, ...]) -> np.ndarray:
+    """Return the fractions that percentiles are of, (fraction, *shape)."""
+    fractions = np.empty((len(FRACTIONS), *shape))
+    fractions.T[:] = FRACTIONS
+    return fractions
 
 
 def _quantiles(cells: np.ndarray, share: np.ndarray, fractions: np.ndarray) -> np.ndarray:
-    """Return the quantiles at fractions (fraction, replicate, line).
+    """Return the quantiles of sorted cells (slice, replicate, line, cell) at fractions (fraction, replicate, line).
 
-    Of one slice linear between cells as np.quantile's are; of several the first size that reaches the fraction.
+    Of one slice linear between cells as np.quantile's are; of several, each with its share of mass, the first size that
+    reaches the fraction.
     """
-    if share.size > 1:
-        cells, share, found = cells[share > 0], share[share > 0], np.empty_like(fractions)
-        for k, line in np.ndindex(fractions.shape[1:]):
-            found[:, k, line] = _weighted(cells[:, k, line], share, fractions[:, k, line])
+    found = np.empty_like(fractions)
+    if share.size == 1:
+        of_rows = (part.reshape(len(fractions), -1) for part in (fractions, found))
+        kernels.quantiles(cells.reshape(-1, cells.shape[-1]), *of_rows)
         return found
-    place = fractions * (cells.shape[-1] - 1)
-    before = place.astype(int)
-    after = np.minimum(before + 1, cells.shape[-1] - 1)
-    replicate, line = np.ogrid[: cells.shape[1], : cells.shape[2]]
-    low, high = (cells[0][replicate, line, k].astype(float) for k in (before, after))
-    return low + (high - low) * (place - before)
+    cells, share = cells[share > 0], share[share > 0]
+    for k, line in np.ndindex(fractions.shape[1:]):
+        found[:, k, line] = _weighted(cells[:, k, line], share, fractions[:, k, line])
+    return found
 
 
 def _weighted(cells: np.ndarray, share: np.ndarray, fractions: np.ndarray) -> np.ndarray:
@@ -300,23 +293,25 @@ class Control(NamedTuple):
     complete: np.ndarray
     exact: Callable
 
-    def corrected(self, passing: np.ndarray, sieves: np.ndarray) -> np.ndarray:
-        """Return the passing (slice, replicate, streamline, sieve)."""
-        counted = _passing(self.complete, sieves.astype(np.float32).astype(float))
-        exact = np.moveaxis(self.exact(size=sieves[:, None, None, None]), 0, -1)
-        # where no cell tells, the ratio is that of the next coarser sieve: 0 would be too little in the mean
-        coarser = np.where(counted > 0, np.arange(sieves.size), sieves.size - 1)
-        coarser = np.minimum.accumulate(coarser[..., ::-1], axis=-1)[..., ::-1]
-        ratio = np.divide(passing, counted, out=np.zeros_like(passing), where=counted > 0)
-        return np.maximum.accumulate(np.take_along_axis(ratio, coarser, axis=-1) * exact, axis=-1)
+    def passing(self, counts: np.ndarray, sieves: np.ndarray) -> np.ndarray:
+        """Return the passing (slice, replicate, streamline, sieve), given how many cells of the product pass."""
+        complete = _count(self.complete, sieves.astype(np.float32).astype(float)[:, None])
+        exact, passing = np.empty((sieves.size, *counts.shape[:-1])), np.empty(counts.shape)
+        exact[:] = self.exact(size=sieves[:, None, None, None])
+        of_rows = (part.reshape(-1, sieves.size) for part in (counts, complete, passing))
+        kernels.correct_passing(*of_rows, exact.reshape(sieves.size, -1))
+        return passing
 
-    def to_read(self, sizes: np.ndarray, fractions: np.ndarray, share: np.ndarray) -> np.ndarray:
-        """Return the fractions (fraction, replicate, line) at which to read percentiles that are about `sizes`."""
-        reached = sizes[:, None] * _ROUNDED  # (fraction, slice, replicate, streamline, or one for all)
-        counted = np.count_nonzero(self.complete <= reached[..., None], axis=-1) / self.complete.shape[-1]
-        exact = self.exact(size=np.broadcast_to(reached, counted.shape))
-        counted, exact = (np.tensordot(share, part, axes=(0, 1)) for part in (counted, exact))
-        if sizes.shape[-1] == 1:
-            counted, exact = (part.mean(axis=-1, keepdims=True) for part in (counted, exact))
-        ratio = np.divide(counted, exact, out=np.ones_like(exact), where=exact > 0)
-        return np.maximum.accumulate(np.minimum(fractions * ratio, 1.0))
+    def fractions(self, sizes: list[np.ndarray], shares: list[np.ndarray]) -> list[np.ndarray]:
+        """Return the fractions at which to read percentiles that are about sizes (fraction, replicate, line or 1)."""
+        at = np.empty((len(sizes), len(FRACTIONS), *self.complete.shape[:-1]))
+        for k, about in enumerate(sizes):
+            np.multiply(about[:, None], _ROUNDED, out=at[k])
+        at = at.reshape(-1, *self.complete.shape[:-1])
+        exact = self.exact(size=at).reshape(len(at), -1)
+        counts = _count(self.complete, at.reshape(exact.shape)) / self.complete.shape[-1]
+        wanted = [_fractions(about.shape[1:]) for about in sizes]
+        for k, share in enumerate(shares):
+            first = k * len(FRACTIONS)
+            kernels.correct_fractions(counts.reshape(-1, len(at)), exact, first, share, wanted[k])
+        return wanted
