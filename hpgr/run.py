@@ -3,6 +3,7 @@
 Not simulate.py: importing a module of that name would replace the function `hpgr.simulate` by the module.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,16 +62,29 @@ def run_scene(scene: Scene, seed: int = 0, replicate: int = 0, beds: Beds | None
     >>> round(result.scene.rolls.gap, 4), round(float(result.values["specific_pressing_force"]))
     (0.059, 4000000)
     """
+    [result] = run_replicates(scene, seed, [replicate], beds)
+    return result
+
+
+def run_replicates(scene: Scene, seed: int, replicates: Sequence[int], beds: Beds | None = None) -> list[Result]:
+    """Run `scene` once for every replicate; its bed, and what is known of it, they share."""
     scene, bed = load(scene, beds)
-    [crushed] = solve.crush(scene, bed, seed, [replicate])
     throughput = metrics.gap_throughput(scene, float(bed.stress.solid_fraction[:, -1].mean()))
     performance = machine.performance(scene, bed.pressed, throughput)
-    found = flags.diagnose(scene, bed, performance, crushed)
-    values = _fields(bed) | _summaries(scene, bed) | performance._asdict() | {"throughput": throughput}
-    values |= _product(scene, crushed) | {"flags": sum(flags.BITS[name] for name in found)}
-    diagnostics = "\n".join(f"{name}: {words}" for name, words in found.items())
+    of_bed = _fields(bed) | _summaries(scene, bed) | performance._asdict() | {"throughput": throughput}
+    products = solve.crush(scene, bed, seed, replicates)
+    limits = flags.diagnose(scene, bed, performance, products)
     solver = solve.choose(scene) + ", control variate" * solve.is_controlled(scene)
-    return Result(scene, bed, values, diagnostics, solver)
+    return [
+        Result(
+            scene,
+            bed,
+            of_bed | _product(scene, crushed) | {"flags": sum(flags.BITS[name] for name in found)},
+            "\n".join(f"{name}: {words}" for name, words in found.items()),
+            solver,
+        )
+        for crushed, found in zip(products, limits, strict=True)
+    ]
 
 
 def simulate(

@@ -45,6 +45,11 @@ def plain(function):
     return getattr(function, "py_func", function)
 
 
+def one_by_one(run_scene):
+    """Return what runs replicates by `run_scene`, in the place of `hpgr.run.run_replicates`."""
+    return lambda scene, seed, replicates, beds: [run_scene(scene, seed, one, beds) for one in replicates]
+
+
 # An ore between real rolls under the paper's laws, of which closed forms are known: no slip, nothing scatters
 _PAPERS_LAWS = {
     "flow.nip_angle": "9.09 deg",

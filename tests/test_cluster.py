@@ -29,14 +29,14 @@ PATCH = """
 import os, time
 import hpgr.run
 
-real = hpgr.run.run_scene
+real = hpgr.run.run_replicates
 
-def run_scene(scene, seed=0, replicate=0, beds=None):
-    time.sleep(0.05)
+def run_replicates(scene, seed, replicates, beds=None):
+    time.sleep(0.05 * len(replicates))
     if scene.rolls.gap == 0.0405: os._exit(7)
-    return real(scene, seed, replicate, beds)
+    return real(scene, seed, replicates, beds)
 
-hpgr.run.run_scene = run_scene
+hpgr.run.run_replicates = run_replicates
 """
 
 

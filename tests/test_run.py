@@ -16,7 +16,7 @@ from hpgr.fields import parts_of, values_of
 from hpgr.grains import closed_form, kernels
 from hpgr.results import flags as limits
 from hpgr.results import schema
-from hpgr.run import load, run_scene
+from hpgr.run import load, run_replicates, run_scene
 
 INF = math.inf
 EQUAL_GAPS = {"rolls.gap": 0.06, "rolls.entry_gap": 0.06}
@@ -472,6 +472,27 @@ def test_every_caller_runs_the_machine_whose_gap_carries_the_force():
     for found in (simulate(scene), swept, refined):
         assert float(found["specific_pressing_force"]) == pytest.approx(4e6, rel=1e-6)
     assert float(swept["operating_gap"]) == np.float32(result.scene.rolls.gap)
+
+
+@pytest.mark.parametrize("name", ["march", "control variate", "width", "closed form", "exchange", "stress only"])
+def test_a_replicate_has_the_same_bits_alone_and_beside_others(name):
+    product = {"resolution.record": "product"}
+    scene = paper(
+        {
+            "march": {},
+            "control variate": product,
+            "width": product | {"roll_width": {}},  # slices are summed in one order
+            "closed form": product | {"strength.cushioning": INF},
+            "exchange": product | {"exchange": {}},
+            "stress only": {"resolution.cells": 0},
+        }[name]
+    )
+    for replicate, together in zip((4, 0, 2), run_replicates(scene, 3, [4, 0, 2]), strict=True):
+        alone = run_scene(scene, 3, replicate)
+        assert together.diagnostics == alone.diagnostics
+        assert together.values.keys() == alone.values.keys()
+        for key, value in alone.values.items():
+            np.testing.assert_array_equal(together.values[key], value, err_msg=key)
 
 
 def test_loading_a_floated_scene_again_changes_nothing():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support import paper, plain_pilot
+from support import one_by_one, paper, plain_pilot
 
 import hpgr
 from hpgr.results import schema
@@ -225,7 +225,7 @@ def run_scene(monkeypatch):
 
     def patch(other):
         real = run.run_scene
-        monkeypatch.setattr(run, "run_scene", lambda *case: other(real, *case))
+        monkeypatch.setattr(run, "run_replicates", one_by_one(lambda *case: other(real, *case)))
 
     return patch
 
@@ -284,14 +284,14 @@ def test_case_that_is_not_finite_loses_itself_only(base, client, good, run_scene
 
 
 def test_lost_task_loses_its_batch_only(base, client, good, monkeypatch):
-    real = run.run_case
+    real = run.run_point
 
-    def run_case(runner, case):
-        if case.index == (1, 0):
+    def run_point(runner, cases):
+        if (1, 0) in (case.index for case in cases):
             raise SystemError("worker lost")
-        return real(runner, case)
+        return real(runner, cases)
 
-    monkeypatch.setattr(run, "run_case", run_case)
+    monkeypatch.setattr(run, "run_point", run_point)
     result = sweep(base, {"rolls.gap": GAPS}, replicates=4, client=client)
     lost_only(result, good, (1, 0), "failed", "SystemError", "worker lost")
 

@@ -1,7 +1,8 @@
 """Limits that a run may hit: one table of their names, bits, conditions and words."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -24,12 +25,8 @@ class Run(NamedTuple):
     scene: Scene
     bed: LoadedBed
     performance: Performance
-    crushed: Crushed | None
-
-    @property
-    def broken(self) -> bool | None:
-        """Whether any grain broke; None where there are none."""
-        return None if self.crushed is None else bool(self.crushed.breaks.any())
+    broken: bool | None  # whether any grain broke; None where there are none
+    below_floor: float  # mass fraction of the product below the size floor
 
 
 class Flag(NamedTuple):
@@ -66,11 +63,21 @@ USUAL = {
 }
 
 
-def diagnose(scene: Scene, bed: LoadedBed, performance: Performance, crushed: Crushed | None) -> dict[str, str]:
-    """Return, by flag, a sentence for each limit that a run hit."""
-    run = Run(scene, bed, performance, crushed)
-    told = ((flag, flag.hit(run)) for flag in FLAGS)
-    return {flag.name: words if isinstance(words, str) else flag.meaning for flag, words in told if words}
+def diagnose(
+    scene: Scene, bed: LoadedBed, performance: Performance, products: Iterable[Crushed | None]
+) -> list[dict[str, str]]:
+    """Return for each product of a bed, by flag, a sentence for each limit that its run hit."""
+
+    @cache  # most replicates agree in both
+    def found(broken: bool | None, below_floor: float) -> dict[str, str]:
+        run = Run(scene, bed, performance, broken, below_floor)
+        told = ((flag, flag.hit(run)) for flag in FLAGS)
+        return {flag.name: words if isinstance(words, str) else flag.meaning for flag, words in told if words}
+
+    return [
+        found(None, 0.0) if one is None else found(bool(one.breaks.any()), float(one.below_floor.mean()))
+        for one in products
+    ]
 
 
 def names(bits: int) -> list[str]:
@@ -176,7 +183,7 @@ def _critical_size(run: Run) -> float:
 
 def _fragment_exponent_held(run: Run) -> str:
     law, largest = run.scene.fragments, run.scene.feed.largest_grain
-    if run.crushed is None or not getattr(law, "size_exponent", 0.0):
+    if run.broken is None or not getattr(law, "size_exponent", 0.0):
         return ""
     parents = (min(max(_critical_size(run), law.size_floor), largest), largest)
     held = [size for size in parents if float(law.exponent_of(size)) in HELD]
@@ -185,9 +192,8 @@ def _fragment_exponent_held(run: Run) -> str:
 
 
 def _size_floor_reached(run: Run) -> str:
-    if run.crushed is None or not run.crushed.below_floor.any():
-        return ""
-    return f"{run.crushed.below_floor.mean():.3g} of the product is below the size floor, where nothing breaks"
+    words = f"{run.below_floor:.3g} of the product is below the size floor, where nothing breaks"
+    return words if run.below_floor else ""
 
 
 FLAGS = (  # in the order in which they are told

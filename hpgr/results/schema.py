@@ -192,7 +192,7 @@ def to_dataset(values: Mapping[str, Any], attrs: Mapping[str, Any], own: Mapping
     """
     table = {**COORDINATES, **VARIABLES, **SWEEP, **own}
     made = {
-        name: xr.Variable(table[name].dims, _stored(value, table[name].dtype), table[name].attributes())
+        name: (table[name].dims, _stored(value, table[name].dtype), table[name].attributes())
         for name, value in values.items()
         if value is not None
     }

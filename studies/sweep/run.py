@@ -1,5 +1,6 @@
 """Cases to dask and back: a bounded number in flight, and a case that takes its worker down loses only itself."""
 
+import itertools
 import logging
 import queue
 import time
@@ -17,13 +18,15 @@ from hpgr.bed.loaded import Beds
 from hpgr.fields import faults_of
 from hpgr.grains import kernels
 from hpgr.results import schema
-from hpgr.run import Result, attributes, run_scene
+from hpgr.run import Result, attributes, run_replicates, run_scene
 from hpgr.tolerance import refine
 from studies.sweep.cases import Addresses, CaseFolder, code_version, result_of, say
 from studies.sweep.space import Case, CaseResult, Space, SweepSpec
 
 Task = Callable[[SweepSpec, list[Case]], list[CaseResult]]
 
+_KNOWN = schema.COORDINATES | schema.VARIABLES
+_SUMMARY = {name: entry for name, entry in _KNOWN.items() if not {"point", "cell", "time"} & set(entry.dims)}
 _AHEAD = 4  # batches in flight for each thread of the workers: enough that none waits for the driver
 _AHEAD_WHOLE = 2  # the same where cases are told whole, which takes memory
 _BATCH = 32  # cases a task holds at most: dask's cost of about 1 ms per task is then under 1 % of a case's
@@ -37,11 +40,11 @@ class OtherCode(RuntimeError):
     """A worker whose code differs from the driver's: its bits would not be those that the address tells."""
 
 
-# ---- one case
+# ---- cases
 
 
 class Runner:
-    """Runs the cases of a batch one after the other, and keeps what the next may share: scene and loaded bed."""
+    """Runs the replicates of one operating point after another, and keeps what the next may share: scene and bed."""
 
     def __init__(self, spec: SweepSpec, at_once: int = 1):
         self.spec = spec
@@ -50,18 +53,18 @@ class Runner:
         self._beds = Beds(1)
         self._room = _room(at_once)
 
-    def run(self, case: Case) -> Result:
-        """Return the results of a case, as `hpgr.simulate` would."""
-        if case.values != self._values:
+    def run(self, values: dict[str, Any], replicates: list[int]) -> list[Result]:
+        """Return the results of replicates of an operating point, as `hpgr.simulate` would."""
+        if values != self._values:
             self._values = None  # a refused scene must not be taken for the next replicate's
-            self._prepare(case)
-            self._values = case.values
-        result = run_scene(self._scene, self.spec.seed, case.replicate, self._beds)
-        return result._replace(values=result.values | self._chosen)
+            self._prepare(values)
+            self._values = values
+        results = run_replicates(self._scene, self.spec.seed, replicates, self._beds)
+        return [result._replace(values=result.values | self._chosen) for result in results]
 
-    def _prepare(self, case: Case) -> None:
+    def _prepare(self, values: dict[str, Any]) -> None:
         spec = self.spec
-        self._scene, self._chosen = spec.base.with_values(case.values), {}
+        self._scene, self._chosen = spec.base.with_values(values), {}
         if spec.tolerance is not None:
             estimate = refine(self._scene, spec.tolerance, run_scene, spec.max_cost, spec.seed)
             self._scene, self._chosen = estimate.scene, estimate.variables()
@@ -75,33 +78,34 @@ def _room(at_once: int) -> tuple[int, str]:
     return available // at_once, shared
 
 
-def run_case(runner: Runner, case: Case) -> CaseResult:
-    """Simulate one case; whatever happens is told in its result, never raised."""
+def run_point(runner: Runner, cases: list[Case]) -> list[CaseResult]:
+    """Simulate cases of one operating point; whatever happens is told in their results, never raised."""
     try:
-        result = runner.run(case)
-        whole = _stored(result.values)
-    except ValidationError as error:
-        return CaseResult(case.index, "refused", faults_of(error), {})
-    except (ValueError, MemoryError) as error:
-        return CaseResult(case.index, "refused", str(error), {})
+        results = runner.run(cases[0].values, [case.replicate for case in cases])
     except Exception as error:  # a fault in one case must not lose the others
-        return CaseResult(case.index, "failed", f"{type(error).__name__}: {error}", {})
-    known = schema.COORDINATES | schema.VARIABLES
-    summary = {name: value for name, value in whole.items() if not {"point", "cell", "time"} & set(known[name].dims)}
+        if len(cases) > 1:  # nor must one replicate the rest
+            return [result for case in cases for result in run_point(runner, [case])]
+        refused = isinstance(error, ValueError | MemoryError)
+        told = faults_of(error) if isinstance(error, ValidationError) else str(error)
+        words = told if refused else f"{type(error).__name__}: {told}"
+        return [CaseResult(cases[0].index, "refused" if refused else "failed", words, {})]
+    return [_told(runner.spec, case, result) for case, result in zip(cases, results, strict=True)]
+
+
+def _told(spec: SweepSpec, case: Case, result: Result) -> CaseResult:
+    """Return what is told of a case that came to a result."""
+    wanted = _KNOWN if spec.whole else _SUMMARY
+    values = {name: result.values[name] for name in wanted if result.values.get(name) is not None}
+    whole = {name: np.asarray(value, wanted[name].dtype) for name, value in values.items()}
+    summary = {name: value for name, value in whole.items() if name in _SUMMARY}
     broken = [name for name, value in summary.items() if not np.isfinite(value).all()]
     if broken:
         return CaseResult(case.index, "failed", f"not finite: {', '.join(broken)}", {})
-    if not runner.spec.whole:
+    if not spec.whole:
         return CaseResult(case.index, "ok", "", summary, result.diagnostics)
     title = "Comminution in high pressure grinding rolls, heterarchical model: one case of a study"
-    attrs = attributes(result, title, runner.spec.seed, case.replicate)
+    attrs = attributes(result, title, spec.seed, case.replicate)
     return CaseResult(case.index, "ok", "", summary, result.diagnostics, whole, attrs)
-
-
-def _stored(values: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Return the variables of a case as they are stored."""
-    known = schema.COORDINATES | schema.VARIABLES
-    return {name: np.asarray(values[name], known[name].dtype) for name in known if values.get(name) is not None}
 
 
 def run_batch(spec: SweepSpec, cases: list[Case]) -> list[CaseResult]:
@@ -109,7 +113,8 @@ def run_batch(spec: SweepSpec, cases: list[Case]) -> list[CaseResult]:
     if spec.code and spec.code != code_version():
         raise OtherCode("a worker's hpgr or libraries differ from the driver's; install the same on both")
     runner = Runner(spec, threads_here())
-    return [run_case(runner, case) for case in cases]
+    points = itertools.groupby(cases, key=lambda case: case.values)
+    return [result for _, point in points for result in run_point(runner, list(point))]
 
 
 def threads_here() -> int:
@@ -157,8 +162,9 @@ class Plan:
         batch: list[int] = []
         while self._queue and len(batch) < self.batch:
             number = self._queue[0]
-            if batch and self.spec.tolerance is not None and number // replicates != batch[0] // replicates:
-                break  # the replicates of an operating point share its refinement
+            another = batch and number // replicates != batch[-1] // replicates
+            if another and len(batch) + replicates > self.batch:
+                break  # the replicates of an operating point share its bed, calls of the kernels, refinement
             self._queue.popleft()
             address = self.addresses[number]
             if number != self._numbers.get(address, [None])[0]:  # read back, or run for another place
