@@ -73,9 +73,9 @@ def available_memory() -> tuple[int, str]:
     A process is bound by its own control group and by every one above it. What files have left in the cache counts as
     free: the system drops it when memory is asked for.
     """
-    limits = [(psutil.virtual_memory().available, "physical memory")]
+    limits, groups = [(psutil.virtual_memory().available, "physical memory")], _own_groups()
     for root, *files in _CGROUPS:
-        for group in _own_groups():
+        for group in groups:
             left = _left_in(root / group, *files)
             if left is not None:
                 limits.append((left, f"the memory limit of cgroup /{'/'.join(group.parts)}"))
@@ -100,7 +100,8 @@ def _own_groups() -> list[Path]:
 def _left_in(group: Path, limit_file: str, used_file: str, cache: str) -> int | None:
     """Return the bytes left in a control group, or None if it has no limit."""
     try:
-        limit = int((group / limit_file).read_text())
+        with open(f"{group}/{limit_file}") as file:  # a path of pathlib costs as much again
+            limit = int(file.read())
         if limit >= _NO_LIMIT:
             return None
         used = int((group / used_file).read_text())

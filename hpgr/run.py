@@ -11,12 +11,15 @@ import xarray as xr
 
 from hpgr import __version__, cost
 from hpgr.bed import machine
-from hpgr.bed.loaded import Beds, LoadedBed, inputs_of, load_bed
+from hpgr.bed.loaded import Beds, LoadedBed, inputs_of
 from hpgr.fields import check_seed
 from hpgr.grains import solve
 from hpgr.results import flags, metrics, schema
 from hpgr.scene import Scene
 from hpgr.tolerance import refine
+
+_LAST = Beds(1)  # a bed costs 0.5 ms, and calls that differ in seed, feed or ore alone have the same
+_KEPT = 100_000  # points of a bed at most for it to be kept, which takes some 20 MB
 
 
 class Result(NamedTuple):
@@ -37,7 +40,8 @@ def load(scene: Scene, beds: Beds | None = None) -> tuple[Scene, LoadedBed]:
     scene : Scene
         What is simulated; its gap is kept if it has no specific pressing force.
     beds : Beds, optional
-        Loaded beds to be shared by scenes that differ in the ore's strength, fragments or cells alone.
+        Loaded beds to be shared by scenes that differ in the ore's strength, fragments or cells alone; default: the
+        bed of the last call, if it is small.
 
     Raises
     ------
@@ -46,7 +50,9 @@ def load(scene: Scene, beds: Beds | None = None) -> tuple[Scene, LoadedBed]:
     """
     scene = machine.float_gap(scene)
     inputs = inputs_of(scene, tessellated=solve.choose(scene).endswith("lattice"))
-    return scene, load_bed(inputs) if beds is None else beds.load(inputs)
+    if beds is None:
+        beds = _LAST if inputs.streamlines * inputs.stress_points <= _KEPT else Beds(1)
+    return scene, beds.load(inputs)
 
 
 def run_scene(scene: Scene, seed: int = 0, replicate: int = 0, beds: Beds | None = None) -> Result:
@@ -166,10 +172,11 @@ def attributes(result: Result, title: str, seed: int, replicate: int) -> dict[st
 def _fields(bed: LoadedBed) -> dict[str, Any]:
     motion, state = bed.kinematics, bed.stress._asdict()
     return {name: field for name, field in state.items() if name in schema.VARIABLES} | {
-        "xi": bed.geometry.xi,
-        "x": motion.x,
-        "height": motion.y,
-        "residence_time": np.broadcast_to(motion.residence_time, motion.x.shape),
+        # copies of what is stored as it is, for a bed may be kept and a Dataset's arrays are its user's
+        "xi": bed.geometry.xi.copy(),
+        "x": motion.x.copy(),
+        "height": motion.y.copy(),
+        "residence_time": np.tile(motion.residence_time, (motion.x.shape[0], 1)),
         "speed": motion.speed,
         "volumetric_strain_rate": motion.volumetric_rate,
         "shear_strain_rate": motion.shear_rate,

@@ -191,13 +191,16 @@ def to_dataset(values: Mapping[str, Any], attrs: Mapping[str, Any], own: Mapping
         If a name is in no table.
     """
     table = {**COORDINATES, **VARIABLES, **SWEEP, **own}
+    given = {name: value for name, value in values.items() if value is not None}
+    data = [name for name in given if name not in COORDINATES and name not in table[name].dims]
     made = {
-        name: (table[name].dims, _stored(value, table[name].dtype), table[name].attributes())
-        for name, value in values.items()
-        if value is not None
+        name: (table[name].dims, _stored(given[name], table[name].dtype), table[name].attributes())
+        for name in [*data, *(name for name in given if name not in data)]
     }
-    coords = {name: made[name] for name in made if name in COORDINATES or name in table[name].dims}
-    return xr.Dataset({name: made[name] for name in made if name not in coords}, coords, attrs)
+    # all as coordinates first: xr.Dataset(data, coords), which looks for what must be merged, takes a sixth longer
+    found = xr.Coordinates(made).to_dataset().reset_coords(data)
+    found.attrs.update(attrs)
+    return found
 
 
 def _stored(value: Any, dtype: type | None) -> Any:
