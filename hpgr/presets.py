@@ -1,10 +1,12 @@
 """Ready scenes. Their values, each with its source, are TOML files in data/presets; a scene file may begin with one."""
 
+import tomllib
+
 from hpgr.scene import DATA, Scene, preset_names
 
 NAMES = preset_names()
 
-__all__ = ["DATA", "NAMES", "industrial", "khd_pilot", "paper"]
+__all__ = ["DATA", "NAMES", "fitting_alike", "industrial", "khd_pilot", "paper"]
 
 
 def paper() -> Scene:
@@ -43,3 +45,24 @@ def industrial() -> Scene:
     'nip'
     """
     return Scene.preset("industrial")
+
+
+def fitting_alike(scene: Scene) -> dict[str, Scene]:
+    """Return scenes with the ore constants that the tests behind a preset tell no worse than its own, by name.
+
+    Empty unless the ore is that of the preset. Of `khd_pilot`, and so of `industrial`: two values of k, the scatter of
+    strength, which decides what a change of feed does and is not told by tests of one feed.
+
+    Examples
+    --------
+    >>> import hpgr
+    >>> {name: one.strength.scatter for name, one in hpgr.presets.fitting_alike(hpgr.presets.industrial()).items()}
+    {'k 0.31': 0.31, 'k 0.54': 0.54}
+    >>> hpgr.presets.fitting_alike(hpgr.presets.paper())
+    {}
+    """
+    fitted = khd_pilot()
+    if (scene.strength, scene.fragments) != (fitted.strength, fitted.fragments):
+        return {}
+    with open(DATA / "khd_pilot_alike.toml", "rb") as file:
+        return {name: scene.with_values(values) for name, values in tomllib.load(file).items()}

@@ -43,12 +43,12 @@ def shown_as(metavar: str, words: str | None = None) -> Any:
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]  # which is off unless it is given
 _LEVELS = tuple(levels())
 
-SceneName = Annotated[
-    str, shown_as("PRESET|FILE", f"Base scene: a preset ({', '.join(presets.NAMES)}), or a .toml or .json scene file.")
-]
+_SCENES = f"preset ({', '.join(presets.NAMES)}), .toml or .json scene file, or .nc file of a study, whose scene it is"
+SceneName = Annotated[str, shown_as("PRESET|FILE", f"Base scene: {_SCENES}.")]
+_OF_FILE = "Default: paper, or the scene of the calibration's file."
+CalibratedScene = Annotated[str | None, shown_as("PRESET|FILE", f"Base scene: {_SCENES}. {_OF_FILE}")]
 SceneNames = Annotated[
-    tuple[str, ...],
-    shown_as("PRESET|FILE ...", f"Scene, or scenes to compare: presets ({', '.join(presets.NAMES)}), .toml or .json."),
+    tuple[str, ...] | None, shown_as("PRESET|FILE ...", f"Scene, or scenes to compare: {_SCENES}. {_OF_FILE}")
 ]
 Vary = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
@@ -111,14 +111,22 @@ def base_scene(options: Any, **resolution: Any) -> Scene:
 def _named_scene(name: str) -> Scene:
     if name in presets.NAMES:
         return Scene.preset(name)
-    if Path(name).suffix not in {".toml", ".json"}:
+    if Path(name).suffix not in {".toml", ".json", ".nc"}:
         raise ValueError(
-            f"--scene: got {name!r}; must be a preset ({', '.join(presets.NAMES)}) or a .toml or .json file"
+            f"--scene: got {name!r}; must be a preset ({', '.join(presets.NAMES)}) or a .toml, .json or .nc file"
         )
     try:
-        return Scene.from_file(name)
+        return _scene_of_study(Path(name)) if Path(name).suffix == ".nc" else Scene.from_file(name)
     except OSError as error:
         raise ValueError(f"--scene: cannot read {name!r}: {error.strerror}") from None
+
+
+def _scene_of_study(path: Path) -> Scene:
+    from hpgr.results.metrics import scene_of
+    from studies.sweep.netcdf import open_result
+
+    with open_result(path) as dataset:
+        return scene_of(dataset)
 
 
 def quantity_of(option: str, text: str, unit: str) -> float:

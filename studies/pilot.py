@@ -127,8 +127,8 @@ def main(options: Options) -> Report:
         return Report([compared(result)], [result])
     known = _chosen(options.calibrate_on, tests)
     scene = starting_scene(options, known)
-    models, samples = _models(scene, known, options.fit, options.baselines)
-    result = assemble(tests, [test.name for test in known], models, scene, samples)
+    models, fitted, samples = _models(scene, known, options.fit, options.baselines)
+    result = assemble(tests, [test.name for test in known], models, fitted, samples)
     from studies.show.plots.pilot import pilot_figure
 
     return Report(words(result, models), [result, figure(lambda: pilot_figure(result), dpi=130)])
@@ -168,8 +168,10 @@ def edge_share(tests: Sequence[Any]) -> float:
     return share if 0 < share < 1 else _EDGE_SHARE
 
 
-def _models(scene: Scene, known: Sequence[Any], fit: Any, baselines: bool) -> tuple[list[Model], dict[str, np.ndarray]]:
-    """Return the fitted models, the lattice first, and samples of its scene fields."""
+def _models(
+    scene: Scene, known: Sequence[Any], fit: Any, baselines: bool
+) -> tuple[list[Model], Scene, dict[str, np.ndarray]]:
+    """Return the fitted models, ours first, its scene, with the sieves of `scene`, and samples of its fields."""
     from hpgr import calibration
 
     print(f"fitting to {', '.join(test.name for test in known)} (about a minute)", flush=True)
@@ -183,7 +185,9 @@ def _models(scene: Scene, known: Sequence[Any], fit: Any, baselines: bool) -> tu
     if baselines:
         for name, predict, told in _baselines(scene, known):
             models.append(Model(name, predict, told))
-    return models, samples
+    remark = f"fitted to {', '.join(test.name for test in known)}"
+    fitted_scene = found.scene.with_values({"resolution.sieves": scene.resolution.sieves, "remark": remark})
+    return models, fitted_scene, samples
 
 
 def _field(scene: Scene, name: str) -> float:

@@ -5,7 +5,7 @@ adds what it does together with others (Saltelli et al. 2010). Fields vary indep
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -36,7 +36,7 @@ class Options(line.Common):
     """What is asked about (default: P80, percent below the sieve, throughput, specific energy, peak pressure)."""
     sample: Annotated[int, shown_as("N")] = 512
     """Points of the design, a power of two; N (fields + 2) cases are run."""
-    scene: line.SceneName = "paper"
+    scene: line.CalibratedScene = None
     sieve: line.Sieve = "1 mm"
     workers: Annotated[int, shown_as("N")] = 2
     """Threads of this process to run cases on."""
@@ -209,7 +209,7 @@ def main(options: Options) -> Report:
     if options.posterior is not None:
         ranges |= line.posterior(options.posterior)
     figures = options.figures or (*FIGURES, f"passing {options.sieve}")
-    scene = line.base_scene(options)
+    scene = line.base_scene(replace(options, scene=options.scene or str(options.posterior or "paper")))
     result = sensitivity(scene, ranges, figures, options.sample, options.seed, threads=options.workers, progress=True)
 
     def drawn() -> Any:

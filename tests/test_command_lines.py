@@ -351,7 +351,6 @@ FAULTY = (
         ("bad.json", "{", ["bad.json", "not JSON", "line 1"]),
         ("empty.toml", "", ["rolls", "feed", "required"]),
         ("faulty.toml", FAULTY, ["rolls.diameter", "rolls.gap", "did you mean 'bottom_size'", "did you mean 'flow'"]),
-        ("floating.toml", SCENE.replace("[feed]", 'specific_pressing_force = "2 N/mm^2"\n[feed]'), ["rolls.gap"]),
     ],
 )
 def test_impossible_scenes_are_refused_with_every_fault(run, folder, name, content, words):
@@ -501,3 +500,13 @@ def test_help_explains_every_option_and_loads_nothing_heavy(capsys):
     assert "python -m studies.gap_sweep" in told
     for preset in hpgr.presets.NAMES:
         assert preset in told
+
+
+def test_a_feed_sweep_of_a_fitted_ore_shows_what_its_tests_cannot_tell(run):
+    few = ("--cells", "20", "--points", "20", "--streamlines", "2", "--replicates", "1", "--feed-top-size", "45 mm")
+    code, out, _ = run("--scene", "industrial", "--no-plot", *few, study=feed_sweep)
+    assert code == 0
+    assert [out.count(f"industrial{name} ") > 0 for name in ("", ", k 0.31", ", k 0.54")] == [True] * 3
+    assert "Tests of one feed tell k" in out
+    code, out, _ = run("--scene", "paper", "--no-plot", "--overwrite", *few, study=feed_sweep)
+    assert "Tests of one feed" not in out

@@ -88,6 +88,25 @@ def test_tests_that_the_model_has_made_are_predicted_blind(written, capsys):
     assert (xr.open_dataset("outputs/pilot.nc").attrs["models"]).startswith("hpgr: calibrated on A, B")
 
 
+def test_a_sweep_takes_the_scene_and_the_samples_of_a_calibration(written, monkeypatch):
+    """Its middle is what the fitted scene gives; its bands hold the truth that made the tests."""
+    from studies import feed_sweep, gap_sweep
+    from studies.show.plots.bands import bands
+
+    monkeypatch.setattr(pilot, "_SAMPLES", 12)
+    assert main([*written, "--calibrate-on", "A", "B", *FIT, *GRID, "--no-baselines", "--no-plot"]) == 0
+    few = ["--calibration", "outputs/pilot.nc", "--replicates", "1"]
+    assert gap_sweep.main([*few, "--press-force", "2.5 N/mm^2", "4.7 N/mm^2"]) == 0
+    assert gap_sweep.main([*few, "--gap", "20 mm", "--out", "other"]) == 2  # the gap floats under the scene's force
+    assert feed_sweep.main([*few, "--no-plot"]) == 0
+    with xr.open_dataset("outputs/gap_sweep.nc") as result, xr.open_dataset("outputs/pilot.nc") as fitted:
+        found = bands(result.load(), 1e-3)
+        measured = 3.6 * fitted["throughput"].sel(source="measured", test=["A", "C"]).values
+    throughput = found["throughput [t/h]"]
+    assert ((throughput.low <= measured * 1.01) & (measured <= throughput.high * 1.01)).all()
+    assert (found["P80 [mm]"].low < found["P80 [mm]"].high).all()
+
+
 def test_edge_share_is_read_off_the_distributions(written):
     tests = tables.read_pilot_tests("psd.csv", "runs.csv")
     assert pilot.edge_share(tests) == pytest.approx(0.22, abs=1e-6)

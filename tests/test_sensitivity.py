@@ -87,7 +87,7 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     assert "passing 1 mm" in printed
     posterior = xr.Dataset({"rolls.gap": ("sample", np.linspace(0.05, 0.06, 50))})
     posterior.to_netcdf("posterior.nc")
-    assert main(["--posterior", "posterior.nc", "--figures", "power", "--out", "p", *small]) == 0
+    assert main(["--posterior", "posterior.nc", "--scene", "paper", "--figures", "power", "--out", "p", *small]) == 0
     with xr.open_dataset("p.nc") as read:
         assert read["total_order"].values == pytest.approx(1, abs=0.3)
     assert main(["--vary", "gap=50 mm,60 mm"]) == 2

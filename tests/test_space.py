@@ -246,7 +246,7 @@ def test_bands_of_a_calibration_apart_from_chance(tmp_path, monkeypatch, capsys)
     file = xr.Dataset({name: ("sample", values) for name, values in drawn.items()} | {"other": ("test", [1.0])})
     netcdf.write_dataset(file, "posterior.nc")
     tiny = ["--replicates", "2", "--cells", "30", "--points", "20", "--streamlines", "2"]
-    tiny += ["--calibration", "posterior.nc"]
+    tiny += ["--scene", "paper", "--calibration", "posterior.nc"]
     assert main([*tiny, "--gap", "50 mm", "60 mm"]) == 0
     assert " to " in capsys.readouterr().out.splitlines()[1]
     with xr.open_dataset("outputs/gap_sweep.nc") as result:

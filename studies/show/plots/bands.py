@@ -7,6 +7,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from studies.show import report
+from studies.show.plots.sweeps import caption_under
 from studies.sweep.space import SAMPLE
 
 _SHOWN = ("below", "W [", "throughput [", "P80 [")
@@ -62,5 +63,9 @@ def bands_figure(result: xr.Dataset, sieve: float, caption: str) -> Figure:
         panel.set(xlabel=report.axis_label(result[first]), ylabel=heading)
         panel.grid(color="0.9")
     figure.legend(*panel.get_legend_handles_labels(), loc="outside upper center", ncols=2)
-    figure.supxlabel(caption, fontsize=9)
+    words = (
+        f"Bands: {result.sizes[SAMPLE]} samples of what the tests of the calibration leave possible; what the model "
+        "misses of tests it has not seen comes on top."
+    )
+    caption_under(figure, result, f"{caption}\n{words}")
     return figure
