@@ -98,8 +98,8 @@ def _told(spec: SweepSpec, case: Case, result: Result) -> CaseResult:
     values = {name: result.values[name] for name in wanted if result.values.get(name) is not None}
     whole = {name: np.asarray(value, wanted[name].dtype) for name, value in values.items()}
     summary = {name: value for name, value in whole.items() if name in _SUMMARY}
-    broken = [name for name, value in summary.items() if not np.isfinite(value).all()]
-    if broken:
+    if not np.isfinite(np.concatenate([value.ravel() for value in summary.values()])).all():  # one by one: 0.1 ms
+        broken = [name for name, value in summary.items() if not np.isfinite(value).all()]
         return CaseResult(case.index, "failed", f"not finite: {', '.join(broken)}", {})
     if not spec.whole:
         return CaseResult(case.index, "ok", "", summary, result.diagnostics)
