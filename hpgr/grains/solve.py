@@ -14,6 +14,7 @@ from hpgr.laws.roll_width import WHOLE, Slices
 from hpgr.scene import Scene
 
 _AT_ONCE = 4000  # points whose closed form is taken at once: each takes up to 20 kB
+_TOGETHER = 50_000  # cells of the replicates crushed at once: with more, new memory costs a tenth of the time
 _ROUNDED = 1 + 1.2e-7  # covers the rounding of a size to float32
 FRACTIONS = (0.5, 0.8)  # of the percentiles every product is summarised by
 
@@ -127,8 +128,12 @@ def crush(scene: Scene, bed: LoadedBed, seed: int, replicates: Sequence[int]) ->
         found = [lattice.run(scene, log_stress, bed, seed, one, reduced=solver != "lattice") for one in replicates]
         return [_summarised(scene, [cells], slices)[0]._replace(exchanged=exchanged) for cells, exchanged in found]
     complete = _complete(scene, log_stress.max(axis=1)[None], slices)[0] if is_controlled(scene) else None
-    found = march.march(scene, log_stress, slices, seed, replicates, complete is not None)
-    return _summarised(scene, list(found), slices, complete)
+    grid, found = scene.resolution, []
+    step = max(_TOGETHER // (slices.share.size * log_stress.shape[0] * grid.snapshots * grid.cells), 1)
+    for k in range(0, len(replicates), step):
+        cells = march.march(scene, log_stress, slices, seed, replicates[k : k + step], complete is not None)
+        found += _summarised(scene, list(cells), slices, complete)
+    return found
 
 
 def _complete(scene: Scene, highest: np.ndarray, slices: Slices) -> tuple[Callable, Callable]:
