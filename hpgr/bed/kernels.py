@@ -3,6 +3,8 @@
 Streamlines do not know of each other. Arrays are (streamline, point), or (point,) of one line, entry to exit; `bed` is
 a `hpgr.bed.geometry.Geometry`, `flow` and `elastic` are the constants of a law. A law has one branch, on its tag: a
 speed profile in `_descent`, an elastic law in `_response`. The tests hold each against its law's NumPy equation.
+
+Written to compile fast: few functions, without `min` and `max`, slices and allocations, 15 to 60 ms each.
 """
 
 import math
@@ -56,13 +58,6 @@ class Line(NamedTuple):
 
 
 @_inner
-def _shape(line, y):
-    """Return the half width X of the bed, m, X' and X'', 1/m."""
-    outer = line.half_gap + y * y * (line.b + line.c * y)
-    return outer, y * (2 * line.b + 3 * line.c * y), 2 * line.b + 6 * line.c * y
-
-
-@_inner
 def _line(bed, flow, nip, xi):
     """Return a streamline of a bed with its nip at the height `nip`, m."""
     outer, slope = bed.half_gap + nip * nip * (bed.b + bed.c * nip), nip * (2 * bed.b + 3 * bed.c * nip)
@@ -74,13 +69,17 @@ def _line(bed, flow, nip, xi):
 
 @_inner
 def _descent(line, flow, y, depth):
-    """Return |v| and |v_y| over U, and the derivatives of the latter by xi and, along the streamline, by y."""
-    outer, slope, curvature = _shape(line, y)
-    t = line.xi * slope
+    """Return |v| and |v_y| over U, the derivatives of the latter by xi and, along the streamline, by y, and the bed.
+
+    Of the bed the half width X, m, X' and X'', 1/m.
+    """
+    outer, slope = line.half_gap + y * y * (line.b + line.c * y), y * (2 * line.b + 3 * line.c * y)
+    curvature, t = 2 * line.b + 6 * line.c * y, line.xi * slope
     steep = 1 + t * t
     if flow.law == NIP and y > line.nip:
         fall = line.flux / outer
-        return math.sqrt(steep) * fall, fall, line.flux_by_xi / outer, -fall * slope / outer
+        by_xi, by_y = line.flux_by_xi / outer, -fall * slope / outer
+        return math.sqrt(steep) * fall, fall, by_xi, by_y, outer, slope, curvature
     g = 1 / math.sqrt(steep)
     speed, by_y = 1 - line.lag * y * y, -2 * line.lag * y
     if flow.law == POWER:
@@ -88,7 +87,7 @@ def _descent(line, flow, y, depth):
         speed = depth if linear else depth**flow.exponent
         by_y = -flow.exponent * (1.0 if linear else speed / depth) / line.height
     turn = speed * t * g * g * g
-    return speed, speed * g, -turn * slope, by_y * g - turn * line.xi * curvature
+    return speed, speed * g, -turn * slope, by_y * g - turn * line.xi * curvature, outer, slope, curvature
 
 
 @_inner
@@ -99,8 +98,7 @@ def _rates(line, flow, y, depth):
     n.(-e').n over the shear rate, n normal to the streamline and e' the strain rate's deviator: 1 in uniaxial
     compaction.
     """
-    speed, fall, by_xi, by_y = _descent(line, flow, y, depth)
-    outer, slope, curvature = _shape(line, y)
+    speed, fall, by_xi, by_y, outer, slope, curvature = _descent(line, flow, y, depth)
     t, v_y = line.xi * slope, -line.height * fall
     v_yx = -line.height * by_xi / outer
     v_yy = -line.height * (by_y - by_xi * t / outer)
@@ -130,8 +128,7 @@ def _at(line, flow, place):
 def _slowness(line, flow, place):
     """Return the time it takes to cross a place, in H/U."""
     y, depth = _at(line, flow, place)
-    _, fall, _, _ = _descent(line, flow, y, depth)
-    return (1.0 if flow.nip_angle > 0 else depth) / fall
+    return (1.0 if flow.nip_angle > 0 else depth) / _descent(line, flow, y, depth)[1]
 
 
 @_inner
@@ -167,41 +164,42 @@ def _march_back(line, flow, edges, duration, places):
 
 
 @_inner
-def _strain(line, flow, unit_time, time_step, places, y, volumetric_rate, shear_rate, volumetric, shear):
-    """Fill the strains of the step that ends at each point, by the trapezoid rule.
+def _strain(i, line, flow, unit_time, time_step, places, y, volumetric_rate, shear_rate, volumetric, shear):
+    """Fill the strains of the step that ends at each point of streamline i, by the trapezoid rule.
 
     They count from the onset of compaction, and of the step with the onset only what lies past it does, lest the
     force jump as a point crosses it: past the nip, with the rates there; else past where the rate, linear between
     two points, turns from dilation.
     """
-    volumetric[0] = shear[0] = 0.0
+    volumetric[i, 0] = shear[i, 0] = 0.0
     begun, nip = flow.nip_angle > 0, line.nip / line.height
-    for j in range(1, y.size):
-        past, first_volumetric, first_shear = time_step, volumetric_rate[j - 1], shear_rate[j - 1]
+    for j in range(1, places.size):
+        past, first_volumetric, first_shear = time_step, volumetric_rate[i, j - 1], shear_rate[i, j - 1]
         begun = begun or first_volumetric > 0
         if not begun:
-            share = volumetric_rate[j] / (volumetric_rate[j] - first_volumetric) if volumetric_rate[j] > 0 else 0.0
-            first_volumetric, first_shear = 0.0, shear_rate[j] + share * (first_shear - shear_rate[j])
+            rate = volumetric_rate[i, j]
+            share = rate / (rate - first_volumetric) if rate > 0 else 0.0
+            first_volumetric, first_shear = 0.0, shear_rate[i, j] + share * (first_shear - shear_rate[i, j])
             past = share * time_step
-        elif flow.nip_angle > 0 and y[j - 1] > line.nip:
-            past = unit_time * _travel(line, flow, places[j], nip - places[j]) if y[j] < line.nip else 0.0
+        elif flow.nip_angle > 0 and y[i, j - 1] > line.nip:
+            past = unit_time * _travel(line, flow, places[j], nip - places[j]) if y[i, j] < line.nip else 0.0
             _, first_volumetric, first_shear, _ = _rates(line, flow, line.nip, 1 - nip)
             first_volumetric, first_shear = first_volumetric / unit_time, first_shear / unit_time
-        volumetric[j] = (volumetric_rate[j] + first_volumetric) * past / 2
-        shear[j] = (shear_rate[j] + first_shear) * past / 2
+        volumetric[i, j] = (volumetric_rate[i, j] + first_volumetric) * past / 2
+        shear[i, j] = (shear_rate[i, j] + first_shear) * past / 2
 
 
 @_compiled
-def lay(bed, nip, flow, surface_speed, edges, y, speed, volumetric_rate, shear_rate, across, volumetric, shear):
+def lay(bed, nip, flow, surface_speed, edges, places, y, speed, volumetric_rate, shear_rate, across, volumetric, shear):
     """Lay the material points; return the time step, s, and the closest that neighbours come in height, m.
 
-    `edges` are the places between panels of quadrature, exit to entry, `nip` the height of the nip, m. Fills heights,
-    m, speeds, m/s, strain rates, 1/s, and `across` of the points, and the strains of the step that ends at each.
+    `edges` are the places between panels of quadrature, exit to entry, `nip` the height of the nip, m, and `places`
+    (point,) work space. Fills heights, m, speeds, m/s, strain rates, 1/s, and `across` of the points, and the strains
+    of the step that ends at each.
     """
     lines, points = y.shape
     middle = _line(bed, flow, nip, 0.0)
-    places, unit_time = np.empty(points), bed.height / surface_speed
-    duration, closest = 0.0, math.inf
+    unit_time, duration, closest = bed.height / surface_speed, 0.0, math.inf
     for k in range(_PANELS):
         duration += _travel(middle, flow, edges[k], edges[k + 1] - edges[k])
     time_step = duration * unit_time / (points - 1)
@@ -213,10 +211,9 @@ def lay(bed, nip, flow, surface_speed, edges, y, speed, volumetric_rate, shear_r
             relative, volume, sheared, across[i, j] = _rates(line, flow, y[i, j], depth)
             speed[i, j] = surface_speed * relative
             volumetric_rate[i, j], shear_rate[i, j] = volume / unit_time, sheared / unit_time
-            if j > 0:
-                closest = min(closest, y[i, j - 1] - y[i, j])
-        rates = volumetric_rate[i], shear_rate[i]
-        _strain(line, flow, unit_time, time_step, places, y[i], rates[0], rates[1], volumetric[i], shear[i])
+            if j > 0 and y[i, j - 1] - y[i, j] < closest:
+                closest = y[i, j - 1] - y[i, j]
+        _strain(i, line, flow, unit_time, time_step, places, y, volumetric_rate, shear_rate, volumetric, shear)
     return time_step, closest
 
 
@@ -245,58 +242,57 @@ def _stiffness(elastic, phi, feed, most):
     cube = phi * phi * phi
     if elastic.densification == 0:
         return cube
-    return cube * ((1 - feed / most) / (1 - min(phi / most, _DENSEST))) ** elastic.densification
+    filled = phi / most if phi / most < _DENSEST else _DENSEST
+    return cube * ((1 - feed / most) / (1 - filled)) ** elastic.densification
 
 
 @_inner
-def _hold_strains(elastic, feed, most, volumetric, shear, eps_v, eps_s, phi, limited):
-    """Fill strains and solid fractions of a streamline: running sums, shear held at the convexity limit."""
+def _hold_strains(i, elastic, feed, most, volumetric, shear, eps_v, eps_s, phi, limited):
+    """Fill strains and solid fractions of streamline i: running sums, shear held at the convexity limit."""
     sum_v = least_v = sum_s = least_s = 0.0
-    for j in range(eps_v.size):
-        sum_v += volumetric[j]
-        least_v = min(least_v, sum_v)
-        eps_v[j] = sum_v - least_v
-        sum_s += shear[j]
-        eps_s[j], limited[j] = sum_s, False
+    for j in range(eps_v.shape[1]):
+        sum_v += volumetric[i, j]
+        least_v = sum_v if sum_v < least_v else least_v
+        strain = sum_v - least_v
+        sum_s += shear[i, j]
+        held, limited[i, j] = sum_s, False
         if elastic.largest_shear_ratio < math.inf:
             # min(s + d, limit) at every step is the plain sum plus the running minimum of limit - plain sum
-            limit = elastic.largest_shear_ratio * eps_v[j]
-            least_s = min(least_s, limit - sum_s)
+            limit = elastic.largest_shear_ratio * strain
+            least_s = limit - sum_s if limit - sum_s < least_s else least_s
             # where the limit is tiny beside the plain sum, rounding would carry their difference past it
-            eps_s[j] = min(max(sum_s + least_s, 0.0), limit)
-            limited[j] = limit - sum_s <= least_s and eps_v[j] > 0
-        phi[j] = min(feed * math.exp(eps_v[j]), most)
+            held = sum_s + least_s if sum_s + least_s > 0.0 else 0.0
+            held = held if held < limit else limit
+            limited[i, j] = limit - sum_s <= least_s and strain > 0
+        solid = feed * math.exp(strain)
+        eps_v[i, j], eps_s[i, j], phi[i, j] = strain, held, solid if solid < most else most
 
 
 @_inner
-def _add_stresses(elastic, feed, most, time_step, volumetric_rate, eps_v, eps_s, phi, p, q):
-    """Fill the stresses of a streamline; return the lowest of their running sums, and of the state function of p.
+def _add_stresses(i, elastic, feed, most, time_step, volumetric_rate, eps_v, eps_s, phi, p, q):
+    """Fill the stresses of streamline i; return the lowest of their running sums, and of the state function of p.
 
     By increments of the state functions, or by Euler's rule, which takes rate and tangent at the start of the step
     and of shear only the elastic part: what the convexity limit takes as plastic loads nothing.
     """
-    sum_p = least_p = sum_q = least_q = least_state = 0.0
+    sum_p = least_p = sum_q = least_q = least_state = state_p = state_q = p_v = p_s = q_s = 0.0
     begun = False
-    state_p, state_q, p_v, p_s, q_s = _response(elastic, eps_v[0], eps_s[0])
-    p[0] = q[0] = 0.0
-    for j in range(1, p.size):
-        new_p, new_q, new_p_v, new_p_s, new_q_s = _response(elastic, eps_v[j], eps_s[j])
-        if elastic.euler:
-            begun = begun or volumetric_rate[j - 1] > 0
-            d_v, d_s = volumetric_rate[j - 1] * time_step, eps_s[j] - eps_s[j - 1]
-            stiffness = _stiffness(elastic, phi[j - 1], feed, most) if begun else 0.0
-            d_p, d_q = p_v * d_v + p_s * d_s, p_s * d_v + q_s * d_s
-        else:
-            stiffness = _stiffness(elastic, (phi[j] + phi[j - 1]) / 2, feed, most)
-            d_p, d_q = new_p - state_p, new_q - state_q
-        sum_p += stiffness * d_p
-        least_p = min(least_p, sum_p)
-        p[j] = sum_p - least_p
-        sum_q += stiffness * d_q
-        least_q = min(least_q, sum_q)
-        q[j] = sum_q - least_q
+    for j in range(p.shape[1]):
+        new_p, new_q, new_p_v, new_p_s, new_q_s = _response(elastic, eps_v[i, j], eps_s[i, j])
+        if j > 0:
+            begun = begun or volumetric_rate[i, j - 1] > 0
+            between = phi[i, j - 1] if elastic.euler else (phi[i, j] + phi[i, j - 1]) / 2
+            stiffness, d_p, d_q = _stiffness(elastic, between, feed, most), new_p - state_p, new_q - state_q
+            if elastic.euler:
+                stiffness = stiffness if begun else 0.0
+                d_v, d_s = volumetric_rate[i, j - 1] * time_step, eps_s[i, j] - eps_s[i, j - 1]
+                d_p, d_q = p_v * d_v + p_s * d_s, p_s * d_v + q_s * d_s
+            sum_p += stiffness * d_p
+            sum_q += stiffness * d_q
+            least_p, least_q = sum_p if sum_p < least_p else least_p, sum_q if sum_q < least_q else least_q
+            least_state = new_p if new_p < least_state else least_state
+        p[i, j], q[i, j] = sum_p - least_p, sum_q - least_q
         state_p, state_q, p_v, p_s, q_s = new_p, new_q, new_p_v, new_p_s, new_q_s
-        least_state = min(least_state, state_p)
     return least_p, least_q, least_state
 
 
@@ -309,12 +305,12 @@ def load(elastic, solid, time_step, volumetric_rate, volumetric, shear, eps_v, e
     is held at the convexity limit. Strains and stresses are held at 0 from below.
     """
     least_p = least_q = least_state = 0.0
+    feed, most = solid
     for i in range(p.shape[0]):
-        held = eps_v[i], eps_s[i], phi[i]
-        _hold_strains(elastic, solid[0], solid[1], volumetric[i], shear[i], held[0], held[1], held[2], limited[i])
-        stresses = _add_stresses(
-            elastic, solid[0], solid[1], time_step, volumetric_rate[i], held[0], held[1], held[2], p[i], q[i]
+        _hold_strains(i, elastic, feed, most, volumetric, shear, eps_v, eps_s, phi, limited)
+        low_p, low_q, low_state = _add_stresses(
+            i, elastic, feed, most, time_step, volumetric_rate, eps_v, eps_s, phi, p, q
         )
-        least_p, least_q = min(least_p, stresses[0]), min(least_q, stresses[1])
-        least_state = min(least_state, stresses[2])
+        least_p, least_q = low_p if low_p < least_p else least_p, low_q if low_q < least_q else least_q
+        least_state = low_state if low_state < least_state else least_state
     return least_p, least_q, least_state

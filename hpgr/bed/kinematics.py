@@ -62,9 +62,8 @@ def move(geometry: Geometry, flow: FlowConstants, surface_speed: float, points: 
     time_step = 0.0
     if geometry.height > 0:
         nip, edges = nip_height(geometry, flow), _panels(geometry, flow)
-        time_step, closest = kernels.lay(
-            geometry, nip, flow, surface_speed, edges, y, speed, *rates, across, volumetric, shear
-        )
+        laid = np.empty(points), y, speed, *rates, across, volumetric, shear
+        time_step, closest = kernels.lay(geometry, nip, flow, surface_speed, edges, *laid)
         _refuse_coinciding(closest / geometry.height, points, flow.entry_fraction)
     else:  # gap = entry gap: no bed to compact; every point is the exit
         speed += surface_speed
