@@ -60,9 +60,9 @@ class Line(NamedTuple):
 @_inner
 def _line(bed, flow, nip, xi):
     """Return a streamline of a bed with its nip at the height `nip`, m."""
-    outer, slope = bed.half_gap + nip * nip * (bed.b + bed.c * nip), nip * (2 * bed.b + 3 * bed.c * nip)
-    kept, t = (1 - flow.slip) * outer, xi * slope
-    g = 1 / math.sqrt(1 + t * t)
+    outer, slope = bed.half_gap + nip * nip * (bed.b + bed.c * nip), nip * (2.0 * bed.b + 3.0 * bed.c * nip)
+    kept, t = (1.0 - flow.slip) * outer, xi * slope
+    g = 1.0 / math.sqrt(1.0 + t * t)
     lag = flow.slip / (nip * nip)
     return Line(bed.half_gap, bed.height, bed.b, bed.c, xi, nip, kept * g, -kept * t * slope * g * g * g, lag)
 
@@ -73,15 +73,15 @@ def _descent(line, flow, y, depth):
 
     Of the bed the half width X, m, X' and X'', 1/m.
     """
-    outer, slope = line.half_gap + y * y * (line.b + line.c * y), y * (2 * line.b + 3 * line.c * y)
-    curvature, t = 2 * line.b + 6 * line.c * y, line.xi * slope
-    steep = 1 + t * t
+    outer, slope = line.half_gap + y * y * (line.b + line.c * y), y * (2.0 * line.b + 3.0 * line.c * y)
+    curvature, t = 2.0 * line.b + 6.0 * line.c * y, line.xi * slope
+    steep = 1.0 + t * t
     if flow.law == NIP and y > line.nip:
         fall = line.flux / outer
         by_xi, by_y = line.flux_by_xi / outer, -fall * slope / outer
         return math.sqrt(steep) * fall, fall, by_xi, by_y, outer, slope, curvature
-    g = 1 / math.sqrt(steep)
-    speed, by_y = 1 - line.lag * y * y, -2 * line.lag * y
+    g = 1.0 / math.sqrt(steep)
+    speed, by_y = 1.0 - line.lag * y * y, -2.0 * line.lag * y
     if flow.law == POWER:
         linear = flow.exponent == 1.0
         speed = depth if linear else depth**flow.exponent
@@ -104,12 +104,12 @@ def _rates(line, flow, y, depth):
     v_yy = -line.height * (by_y - by_xi * t / outer)
     v_xx = slope / outer * v_y + t * v_yx
     v_xy = line.xi * (curvature - slope * slope / outer) * v_y + t * v_yy
-    third = (v_xx + v_yy) / 3
-    xx, yy, xy = v_xx - third, v_yy - third, (v_xy + v_yx) / 2
-    shear = math.sqrt(2 / 3 * (xx * xx + yy * yy + third * third + 2 * xy * xy))
-    across = (2 * t * xy - xx - t * t * yy) / ((1 + t * t) * shear) if shear > 0 else 0.0
+    third = (v_xx + v_yy) / 3.0
+    xx, yy, xy = v_xx - third, v_yy - third, (v_xy + v_yx) / 2.0
+    shear = math.sqrt(2.0 / 3.0 * (xx * xx + yy * yy + third * third + 2.0 * xy * xy))
+    across = (2.0 * t * xy - xx - t * t * yy) / ((1.0 + t * t) * shear) if shear > 0.0 else 0.0
     # above a nip 0 by construction: what is left is rounding
-    return speed, 0.0 if flow.nip_angle > 0 and y > line.nip else -(v_xx + v_yy), shear, across
+    return speed, 0.0 if flow.nip_angle > 0.0 and y > line.nip else -(v_xx + v_yy), shear, across
 
 
 @_inner
@@ -119,8 +119,8 @@ def _at(line, flow, place):
     Towards a nip places are y/H. Below a stagnant entry they are -log(depth), which stays exact however close the
     first point comes to it.
     """
-    if flow.nip_angle > 0:
-        return line.height * place, 1 - place
+    if flow.nip_angle > 0.0:
+        return line.height * place, 1.0 - place
     return -line.height * math.expm1(-place), math.exp(-place)
 
 
@@ -128,7 +128,7 @@ def _at(line, flow, place):
 def _slowness(line, flow, place):
     """Return the time it takes to cross a place, in H/U."""
     y, depth = _at(line, flow, place)
-    return (1.0 if flow.nip_angle > 0 else depth) / _descent(line, flow, y, depth)[1]
+    return (1.0 if flow.nip_angle > 0.0 else depth) / _descent(line, flow, y, depth)[1]
 
 
 @_inner
@@ -152,7 +152,7 @@ def _march_back(line, flow, edges, duration, places):
             left = duration * ((last - j) / last) - passed
             # the cubic through the panel's ends with their slopes is 1e-6 off; each pass squares that
             u, low, high = left / time, time / slow_start - width, time / slow - width
-            length = u * (width + (1 - u) * (low * (1 - u) - high * u))
+            length = u * (width + (1.0 - u) * (low * (1.0 - u) - high * u))
             for _ in range(4):
                 miss = _travel(line, flow, start, length) - left
                 length -= miss / _slowness(line, flow, start + length)
@@ -172,21 +172,21 @@ def _strain(i, line, flow, unit_time, time_step, places, y, volumetric_rate, she
     two points, turns from dilation.
     """
     volumetric[i, 0] = shear[i, 0] = 0.0
-    begun, nip = flow.nip_angle > 0, line.nip / line.height
+    begun, nip = flow.nip_angle > 0.0, line.nip / line.height
     for j in range(1, places.size):
         past, first_volumetric, first_shear = time_step, volumetric_rate[i, j - 1], shear_rate[i, j - 1]
-        begun = begun or first_volumetric > 0
+        begun = begun or first_volumetric > 0.0
         if not begun:
             rate = volumetric_rate[i, j]
-            share = rate / (rate - first_volumetric) if rate > 0 else 0.0
+            share = rate / (rate - first_volumetric) if rate > 0.0 else 0.0
             first_volumetric, first_shear = 0.0, shear_rate[i, j] + share * (first_shear - shear_rate[i, j])
             past = share * time_step
-        elif flow.nip_angle > 0 and y[i, j - 1] > line.nip:
+        elif flow.nip_angle > 0.0 and y[i, j - 1] > line.nip:
             past = unit_time * _travel(line, flow, places[j], nip - places[j]) if y[i, j] < line.nip else 0.0
-            _, first_volumetric, first_shear, _ = _rates(line, flow, line.nip, 1 - nip)
+            _, first_volumetric, first_shear, _ = _rates(line, flow, line.nip, 1.0 - nip)
             first_volumetric, first_shear = first_volumetric / unit_time, first_shear / unit_time
-        volumetric[i, j] = (volumetric_rate[i, j] + first_volumetric) * past / 2
-        shear[i, j] = (shear_rate[i, j] + first_shear) * past / 2
+        volumetric[i, j] = (volumetric_rate[i, j] + first_volumetric) * past / 2.0
+        shear[i, j] = (shear_rate[i, j] + first_shear) * past / 2.0
 
 
 @_compiled
@@ -227,23 +227,23 @@ def _response(elastic, eps_v, eps_s):
     At zero strain the bed is free of stress.
     """
     c, bulk, shear = elastic.exponent, elastic.bulk_modulus, elastic.shear_modulus
-    if not eps_v > 0:
-        stiff = 1.0 if c == 0 else 0.0
+    if not eps_v > 0.0:
+        stiff = 1.0 if c == 0.0 else 0.0
         return 0.0, 0.0, stiff * bulk, 0.0, stiff * 3 * shear
     power, eta = eps_v**c, eps_s / eps_v
-    p = power * eps_v * (bulk / (c + 1) + 1.5 * shear * c * (eta * eta))
-    p_v = power * (bulk + 1.5 * shear * c * (c - 1) * (eta * eta))
-    return p, 3 * shear * (power * eps_v) * eta, p_v, power * 3 * shear * c * eta, power * 3 * shear
+    p = power * eps_v * (bulk / (c + 1.0) + 1.5 * shear * c * (eta * eta))
+    p_v = power * (bulk + 1.5 * shear * c * (c - 1.0) * (eta * eta))
+    return p, 3.0 * shear * (power * eps_v) * eta, p_v, power * 3.0 * shear * c * eta, power * 3.0 * shear
 
 
 @_inner
 def _stiffness(elastic, phi, feed, most):
     """Return phi^3, times what it gains as pores close between the solid fractions `feed` and `most`."""
     cube = phi * phi * phi
-    if elastic.densification == 0:
+    if elastic.densification == 0.0:
         return cube
     filled = phi / most if phi / most < _DENSEST else _DENSEST
-    return cube * ((1 - feed / most) / (1 - filled)) ** elastic.densification
+    return cube * ((1.0 - feed / most) / (1.0 - filled)) ** elastic.densification
 
 
 @_inner
@@ -263,7 +263,7 @@ def _hold_strains(i, elastic, feed, most, volumetric, shear, eps_v, eps_s, phi, 
             # where the limit is tiny beside the plain sum, rounding would carry their difference past it
             held = sum_s + least_s if sum_s + least_s > 0.0 else 0.0
             held = held if held < limit else limit
-            limited[i, j] = limit - sum_s <= least_s and strain > 0
+            limited[i, j] = limit - sum_s <= least_s and strain > 0.0
         solid = feed * math.exp(strain)
         eps_v[i, j], eps_s[i, j], phi[i, j] = strain, held, solid if solid < most else most
 
@@ -280,8 +280,8 @@ def _add_stresses(i, elastic, feed, most, time_step, volumetric_rate, eps_v, eps
     for j in range(p.shape[1]):
         new_p, new_q, new_p_v, new_p_s, new_q_s = _response(elastic, eps_v[i, j], eps_s[i, j])
         if j > 0:
-            begun = begun or volumetric_rate[i, j - 1] > 0
-            between = phi[i, j - 1] if elastic.euler else (phi[i, j] + phi[i, j - 1]) / 2
+            begun = begun or volumetric_rate[i, j - 1] > 0.0
+            between = phi[i, j - 1] if elastic.euler else (phi[i, j] + phi[i, j - 1]) / 2.0
             stiffness, d_p, d_q = _stiffness(elastic, between, feed, most), new_p - state_p, new_q - state_q
             if elastic.euler:
                 stiffness = stiffness if begun else 0.0

@@ -26,13 +26,12 @@ from numba.extending import intrinsic
 from hpgr.laws.fragments import HELD, POWER_LAW
 from hpgr.laws.strength import SIZE_EFFECT
 
-_compiled = njit(cache=True, nogil=True, error_model="numpy")
+_HOW = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_compiled = njit(**_HOW)
 # Functions that Python does not call need no wrappers, which cost most of the time to compile; and handing the arrays
-# of a step over costs as much as a short loop
-_inner = njit(cache=True, nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
-_inlined = njit(
-    cache=True, nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True
-)
+# of a step over costs as much as a short loop. A function costs 15 ms to compile, a `min` or `max` of new types 40
+_inner = njit(**_HOW, no_cpython_wrapper=True)
+_inlined = njit(**_HOW, no_cpython_wrapper=True, forceinline=True)
 
 BLOCK = 16  # cells; as many as the vectors below
 DENSE = 1 / 64  # swap probability of an edge from which deciding every cell is cheaper than skipping
@@ -53,8 +52,10 @@ class Ore(NamedTuple):
 
     strength: int  # tag
     slope: float  # 3 / w
+    scale: float  # 3 / w, by which effective size answers to strength; without size effect 1
     cushion: float  # 1 / (2 n^2)
     reference_size: float  # m
+    inverse_size: float  # 1 / reference_size; without size effect 0
     scatter: float  # k
     fragments: int  # tag
     inverse_exponent: float | None  # 1 / gamma; None where fragments are uniform
@@ -246,22 +247,16 @@ def mix(state):
     return z ^ (z >> _SHIFT_31)
 
 
-@_compiled
+@_inner
 def uniform(state):
     """Return U in (0, 1) from the 52 upper bits of a stream's number."""
     return (np.float64(np.int64(mix(state) >> _SHIFT_12)) + 0.5) * 2.0**-52
 
 
 @_inner
-def _scale(ore):
-    """Return 3 / w, by which effective size answers to strength; without size effect it is 1 / strength."""
-    return ore.slope if ore.slope > 0.0 else 1.0
-
-
-@_inner
 def _weakness(state, ore):
     """Return zeta^(-w/3), P(zeta > x) = exp(-x^k), by the number after the one that a stream is at."""
-    power = (-math.log(uniform(mix(state)))) ** (-1.0 / (ore.scatter * _scale(ore)))
+    power = (-math.log(uniform(mix(state)))) ** (-1.0 / (ore.scatter * ore.scale))
     return np.float32(min(max(power, 1e-30), 1e30))
 
 
@@ -373,7 +368,7 @@ def correct_fractions(counts, exact, first, share, fractions):
                 fractions[f, r, n] = before
 
 
-@_compiled
+@_inner
 def sieve_class(sieves, size):
     """Return how many of the rising `sieves` are finer than `size`."""
     low, high = 0, sieves.size
@@ -442,33 +437,21 @@ def _raise(exponent, count, values, bits, exponents, powers, power_bits):
 
 
 @_inlined
-def _unshielded(size, bound_per_size, size_floor):
+def _unshielded(size, ore):
     """Return the bound of a cell whose neighbourhood is new; nothing below the floor ever breaks."""
     # without size effect every size may break
-    bound = np.float32(size * bound_per_size) if bound_per_size != 0.0 else np.float32(_MARGIN)
-    return _NEVER if size < size_floor else bound
-
-
-@_inner
-def _bound_per_size(ore):
-    return _MARGIN / ore.reference_size if ore.slope > 0.0 else 0.0
-
-
-@_inner
-def _close(line):
-    """Copy the ends of a periodic line to the places beyond them."""
-    line[0], line[line.size - 1] = line[line.size - 2], line[1]
+    bound = np.float32(size * (ore.inverse_size * _MARGIN)) if ore.inverse_size > 0.0 else np.float32(_MARGIN)
+    return _NEVER if size < ore.size_floor else bound
 
 
 @_inner
 def _set_bounds(sizes, weakness, slot, unshielded, bounds, block_bounds, ore):
     """Set the bounds of a line of cells whose neighbourhoods are all new."""
     cells = sizes.size - 2
-    bound_per_size, size_floor = _bound_per_size(ore), ore.size_floor
-    _close(sizes)
+    sizes[0], sizes[cells + 1] = sizes[cells], sizes[1]
     unshielded[0] = unshielded[cells + 1] = _NEVER
     for p in range(1, cells + 1):
-        unshielded[p] = _unshielded(np.float64(sizes[p]), bound_per_size, size_floor)
+        unshielded[p] = _unshielded(np.float64(sizes[p]), ore)
     if weakness is not None:
         for p in range(1, cells + 1):
             unshielded[p] *= weakness[slot, p]
@@ -500,9 +483,9 @@ def _list_candidates(needed, bounds, active, actives, places):
 @_inlined
 def _gather(sizes, weakness, slot, places, candidates, ore, found, totals, ratios):
     """Fill sizes found, their sums with both neighbours, and effective sizes over s_m without neighbours."""
-    inverse_size = 1.0 / ore.reference_size if ore.slope > 0.0 else 0.0
+    inverse_size = ore.inverse_size
     for k in range(candidates):
-        p = np.uint64(places[k])
+        p = places[k]
         size = np.float64(sizes[p])
         # neighbours first: their sum is the same bits in a mirrored line
         totals[k] = (np.float64(sizes[p - _1]) + np.float64(sizes[p + _1])) + size
@@ -510,7 +493,7 @@ def _gather(sizes, weakness, slot, places, candidates, ore, found, totals, ratio
         ratios[k] = size * inverse_size if inverse_size > 0.0 else 1.0
     if weakness is not None:
         for k in range(candidates):
-            ratios[k] *= np.float64(weakness[slot, np.uint64(places[k])])
+            ratios[k] *= np.float64(weakness[slot, places[k]])
 
 
 @_inlined
@@ -550,9 +533,9 @@ def _decide_by_logarithms(count, sizes, totals, weakness, slot, places, ore, log
             unlike = math.log(sizes[k] / (totals[k] / 3.0))
             strength = ore.cushion * unlike * unlike - ore.slope * math.log(sizes[k] / ore.reference_size)
             if weakness is not None:
-                strength -= _scale(ore) * math.log(weakness[slot, places[k]])
+                strength -= ore.scale * math.log(weakness[slot, places[k]])
             breaks[k] = log_stress >= strength
-            bounds[k] = np.float32(math.exp(-strength / _scale(ore)) * _MARGIN)
+            bounds[k] = np.float32(math.exp(-strength / ore.scale) * _MARGIN)
 
 
 @_inlined
@@ -562,7 +545,7 @@ def _list_breaks(candidates, found_bounds, breaks, bounds, places):
     found = np.int64(0)
     for k in range(candidates):
         p = places[k]
-        bounds[np.uint64(p)] = found_bounds[k]
+        bounds[p] = found_bounds[k]
         places[found] = p
         found += breaks[k]
     return found
@@ -572,7 +555,7 @@ def _list_breaks(candidates, found_bounds, breaks, bounds, places):
 def _draw(streams, places, found, states, ratios):
     """Draw a uniform number for each cell that breaks."""
     for k in range(found):
-        p = np.uint64(places[k])
+        p = places[k]
         states[k] = streams[p] + _GOLDEN
         streams[p] = states[k]
     for k in range(found):
@@ -603,10 +586,10 @@ def _settle_powers(exponent, sizes, streams, places, found, ratios, exponents):
     if exponent is not None:
         doubts = np.int64(0)
         for k in range(found):
-            size, ratio = sizes[np.uint64(places[k])], ratios[k]
+            size, ratio = sizes[places[k]], ratios[k]
             doubts += np.float32(size * (ratio * (1.0 - 1e-12))) != np.float32(size * (ratio * (1.0 + 1e-12)))
         for k in range(found if doubts else 0):
-            p = np.uint64(places[k])
+            p = places[k]
             if np.float32(sizes[p] * (ratios[k] * (1.0 - 1e-12))) != np.float32(sizes[p] * (ratios[k] * (1.0 + 1e-12))):
                 ratios[k] = uniform(streams[p]) ** exponents[k]
 
@@ -614,13 +597,12 @@ def _settle_powers(exponent, sizes, streams, places, found, ratios, exponents):
 @_inlined
 def _break(sizes, unshielded, places, found, ore, ratios):
     """Replace each cell that breaks by its fragment."""
-    bound_per_size, size_floor = _bound_per_size(ore), ore.size_floor
     for k in range(found):
-        p = np.uint64(places[k])
-        size = np.float32(max(sizes[p] * ratios[k], SMALLEST))
+        p, ratio = places[k], ratios[k]
+        size = np.float32(sizes[p] * ratio if sizes[p] * ratio > SMALLEST else SMALLEST)
         sizes[p] = size
-        unshielded[p] = _unshielded(np.float64(size), bound_per_size, size_floor)
-    _close(sizes)
+        unshielded[p] = _unshielded(np.float64(size), ore)
+    sizes[0], sizes[sizes.size - 1] = sizes[sizes.size - 2], sizes[1]
 
 
 @_inner
@@ -628,7 +610,7 @@ def _draw_strength(streams, weakness, slot, unshielded, places, found, ore):
     """Draw the strength of each fragment."""
     if weakness is not None:
         for k in range(found):
-            p = np.uint64(places[k])
+            p = places[k]
             weakness[slot, p] = _weakness(streams[p], ore)
             unshielded[p] *= weakness[slot, p]
 
@@ -646,38 +628,29 @@ def _keep(sizes, counts, k, j, snapshots, classes):
 
 @_inlined
 def _renew(unshielded, bounds, places, found):
-    """Set anew the bounds of the cells that broke and of their neighbours but across the ends of the line."""
-    for k in range(found):
-        p = np.uint64(places[k])
-        bounds[p - _1], bounds[p], bounds[p + _1] = unshielded[p - _1], unshielded[p], unshielded[p + _1]
-
-
-@_inlined
-def _renew_ends(unshielded, bounds, first, last):
-    """Set anew the bound of each end of the line beside which a cell broke, by the first and last place that did."""
+    """Set anew the bounds of the cells that broke and of their neighbours, around the ends of the line too."""
     cells = unshielded.size - 2
-    right, left = bounds[cells], bounds[1]
-    bounds[cells] = unshielded[cells] if first == 1 else right
-    bounds[1] = unshielded[1] if last == cells else left
+    for k in range(found):
+        p = places[k]
+        bounds[p - _1], bounds[p], bounds[p + _1] = unshielded[p - _1], unshielded[p], unshielded[p + _1]
+    if found and places[0] == 1:
+        bounds[cells] = unshielded[cells]
+    if found and places[found - 1] == cells:
+        bounds[1] = unshielded[1]
 
 
 @_inlined
-def _renew_blocks(bounds, block_bounds, active, actives):
-    """Take the largest bounds of the active blocks anew."""
+def _renew_blocks(bounds, block_bounds, active, actives, cells):
+    """Take the largest bounds of the active blocks anew; raise those beside them, where a seam was crossed."""
     for k in range(actives):
         block_bounds[active[k]] = _largest(bounds, np.int64(active[k]) * BLOCK + 1)
-
-
-@_inlined
-def _renew_seams(bounds, block_bounds, active, actives, cells):
-    """Raise the largest bounds of the blocks beside the active ones, where a seam was crossed."""
     last = (cells - 1) // BLOCK
     for k in range(actives):
         block = np.int64(active[k])
         before, after = block - 1 if block > 0 else last, block + 1 if block < last else 0
-        end = (before + 1) * BLOCK if before < last else cells
-        block_bounds[before] = max(block_bounds[before], bounds[end])
-        block_bounds[after] = max(block_bounds[after], bounds[after * BLOCK + 1])
+        end, start = bounds[(before + 1) * BLOCK if before < last else cells], bounds[after * BLOCK + 1]
+        block_bounds[before] = end if end > block_bounds[before] else block_bounds[before]
+        block_bounds[after] = start if start > block_bounds[after] else block_bounds[after]
 
 
 @_compiled
@@ -691,7 +664,7 @@ def crush(parcels, passage, path, ore, work, record):
     active, places, chosen, bits, totals, ratios, ratio_bits, states, tight, breaking, unsure = work
     log_stress, critical_ratio = path
     sieves, counts = record.sieves, record.counts
-    cells, cushion = parcels.sizes.shape[1] - 2, ore.cushion / _scale(ore)
+    cells, cushion = parcels.sizes.shape[1] - 2, ore.cushion / ore.scale
     for k in range(passage.slots.size):
         slot, line = passage.slots[k], passage.lines[k]
         sizes, streams = parcels.sizes[slot], parcels.streams[slot]
@@ -703,7 +676,7 @@ def crush(parcels, passage, path, ore, work, record):
                 if parcels.bounds_outdated[slot]:
                     _set_bounds(sizes, parcels.weakness, slot, unshielded, bounds, block_bounds, ore)
                     parcels.bounds_outdated[slot] = False
-                needed = np.float32(min(critical, 3e38))  # float32 ends there, beyond every effective size
+                needed = np.float32(critical if critical < 3e38 else 3e38)  # beyond every effective size of float32
                 actives = _list_blocks(needed, block_bounds, active)
                 count = _list_candidates(needed, bounds, active, actives, places)
                 _gather(sizes, parcels.weakness, slot, places, count, ore, chosen, totals, ratios)
@@ -727,10 +700,7 @@ def crush(parcels, passage, path, ore, work, record):
                 _draw_strength(streams, parcels.weakness, slot, unshielded, places, found, ore)
                 _count(sizes, places, found, sieves, k, 1, counts)
                 _renew(unshielded, bounds, places, found)
-                if found:
-                    _renew_ends(unshielded, bounds, places[0], places[found - 1])
-                _renew_blocks(bounds, block_bounds, active, actives)
-                _renew_seams(bounds, block_bounds, active, actives, cells)
+                _renew_blocks(bounds, block_bounds, active, actives, cells)
                 parcels.breaks[slot] += found
             _keep(sizes, counts, k, j, record.snapshots, record.classes)
 

@@ -15,8 +15,10 @@ class StrengthConstants(NamedTuple):
 
     strength: int
     slope: float  # 3 / w
+    scale: float  # 3 / w, by which effective size answers to strength; without size effect 1
     cushion: float  # 1 / (2 n^2)
     reference_size: float  # m
+    inverse_size: float  # 1 / reference_size, 1/m; without size effect 0
     scatter: float  # k
 
 
@@ -115,7 +117,9 @@ class SizeEffectStrength(Frozen):
     def constants(self) -> StrengthConstants:
         """Return the law as the kernels take it."""
         cushion = 1 / (2 * self.cushioning * self.cushioning)  # a power would raise where the product is inf
-        return StrengthConstants(SIZE_EFFECT, 3 / self.weibull_modulus, cushion, self.reference_size, self.scatter)
+        slope, inverse_size = 3 / self.weibull_modulus, 1 / self.reference_size
+        scale, inverse_size = (slope, inverse_size) if slope > 0 else (1.0, 0.0)
+        return StrengthConstants(SIZE_EFFECT, slope, scale, cushion, self.reference_size, inverse_size, self.scatter)
 
 
 Strength = SizeEffectStrength
