@@ -21,7 +21,7 @@ from hpgr.fields import show
 from hpgr.grains import solve
 from hpgr.laws.feed import Feed, TableFeed
 from hpgr.run import load, run_scene
-from hpgr.scene import Scene, field_info
+from hpgr.scene import Scene, check_scene, field_info
 from hpgr.tables import PilotTest, read_pilot_tests
 
 PARTS, FIGURES = ("centre", "edge", "total"), ("throughput", "power", "specific_energy")
@@ -210,6 +210,8 @@ def calibrate(
 
     Raises
     ------
+    TypeError
+        If `scene` is none.
     OSError, ValueError
         If a table cannot be read or a name is unknown, or the scene lacks what is to be fitted.
 
@@ -223,6 +225,7 @@ def calibrate(
     >>> list(found.estimates)
     ['sigma_m', 'gamma']
     """
+    check_scene(scene)
     known = {test.name: test for test in read_pilot_tests(product, operations)}
     wanted = list(known) if tests is None else list(tests)
     unknown = [repr(name) for name in wanted if name not in known]

@@ -97,6 +97,22 @@ def parse(text: str, unit: str) -> float:
     return float(f"{magnitude:.15g}")  # "13 mm" is the float 0.013, not its neighbour that 13 times 1e-3 gives
 
 
+_RANGES = {  # of numbers that functions take beside a scene: least, most, unit and an example
+    "tolerance": ("1e-4", "0.5", "", "0.01"),
+    "max_cost": ("0", "inf", " s", "60"),
+    "timeout": ("0.1", "1e6", " s", "60"),
+    "percent": ("0", "100", "", "80"),
+}
+
+
+def check_number(name: str, value: Any) -> None:
+    """Raise ValueError if an argument of a public function is not a number in its range."""
+    least, most, unit, example = _RANGES[name]
+    number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    if not number or not float(least) <= value <= float(most):
+        raise ValueError(f"{name}: got {value!r}; must be within {least} to {most}{unit}; such as {name}={example}")
+
+
 def check_seed(name: str, value: int) -> None:
     """Raise ValueError if a seed or replicate number is not a whole number that a result file can hold."""
     try:

@@ -12,10 +12,10 @@ import xarray as xr
 from hpgr import __version__, cost
 from hpgr.bed import machine
 from hpgr.bed.loaded import Beds, LoadedBed, inputs_of
-from hpgr.fields import check_seed
+from hpgr.fields import check_number, check_seed
 from hpgr.grains import solve
 from hpgr.results import flags, metrics, schema
-from hpgr.scene import Scene
+from hpgr.scene import Scene, check_scene
 from hpgr.tolerance import refine
 
 _LAST = Beds(1)  # a bed costs 0.5 ms, and calls that differ in seed, feed or ore alone have the same
@@ -125,9 +125,9 @@ def simulate(
     TypeError
         If `scene` is none, such as the path of one.
     ValueError
-        If the seed or replicate is not a whole number from 0 to 2**63 - 1, if material points coincide, if exchange
-        would need absurdly many substeps, if no gap carries the scene's pressing force, or if the tolerance cannot be
-        met under `max_cost`.
+        If the tolerance or `max_cost` is not a number in its range, or the seed or replicate not a whole number from 0
+        to 2**63 - 1; if material points coincide, if exchange would need absurdly many substeps, if no gap carries the
+        scene's pressing force, or if the tolerance cannot be met under `max_cost`.
     MemoryError
         If the scene does not fit this machine's memory; the message has the predicted bytes.
 
@@ -139,10 +139,10 @@ def simulate(
     >>> dict(dataset["size"].sizes)
     {'time': 1, 'streamline': 10, 'point': 50, 'cell': 200}
     """
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene: got {scene!r:.80}; must be a scene; such as hpgr.Scene.from_file('my_machine.toml')")
+    check_scene(scene)
     check_seed("seed", seed)
     check_seed("replicate", replicate)
+    check_number("max_cost", max_cost)
     chosen = {}
     if tolerance is not None:
         estimate = refine(scene, tolerance, run_scene, max_cost, seed)

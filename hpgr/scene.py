@@ -393,6 +393,12 @@ class Scene(Frozen):
     __str__ = __repr__
 
 
+def check_scene(scene: Any) -> None:
+    """Raise TypeError if an argument is no scene, such as the path of one."""
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene: got {scene!r:.80}; must be a scene; such as hpgr.Scene.from_file('my_machine.toml')")
+
+
 def preset_names() -> tuple[str, ...]:
     """Return the names of the ready scenes."""
     return tuple(sorted(path.stem for path in (DATA / "presets").glob("*.toml")))

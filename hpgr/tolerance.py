@@ -13,6 +13,7 @@ import numpy as np
 
 from hpgr import cost
 from hpgr.bed.loaded import Beds
+from hpgr.fields import check_number
 from hpgr.grains import solve
 from hpgr.results import schema
 from hpgr.scene import Scene
@@ -71,8 +72,7 @@ def refine(scene: Scene, tolerance: float, run: Run, max_cost: float = 60.0, see
     ValueError
         If the tolerance is out of range, or cannot be met under `max_cost`; the message has the predicted cost.
     """
-    if not 1e-4 <= tolerance <= 0.5:
-        raise ValueError(f"tolerance: got {tolerance!r}; must be within 1e-4 to 0.5; such as tolerance=0.01")
+    check_number("tolerance", tolerance)
     spent = _Purse(run, tolerance, max_cost)
     kept = {f"resolution.{name}": getattr(scene.resolution, name) for name in ("record", "snapshots")}
     scene = scene.with_values({"resolution.snapshots": 1})

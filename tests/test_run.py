@@ -17,6 +17,7 @@ from hpgr.grains import closed_form, kernels
 from hpgr.results import flags as limits
 from hpgr.results import schema
 from hpgr.run import load, run_replicates, run_scene
+from studies.sweep import sweep
 
 INF = math.inf
 EQUAL_GAPS = {"rolls.gap": 0.06, "rolls.entry_gap": 0.06}
@@ -452,6 +453,44 @@ def test_substeps_refine_the_stress_and_keep_the_points(values):
     assert np.array_equal(refined["continuity_solid_fraction"], fine["continuity_solid_fraction"])
 
 
+# --- what is no argument ----------------------------------------------------------------------------------------
+
+NO_ARGUMENTS = {
+    "tolerance: got '1%'; must be within 1e-4 to 0.5; such as tolerance=0.01": lambda s, d: simulate(s, tolerance="1%"),
+    "tolerance: got True; must be": lambda s, d: simulate(s, tolerance=True),
+    "max_cost: got 'x'; must be within 0 to inf s; such as": lambda s, d: simulate(s, tolerance=0.1, max_cost="x"),
+    "max_cost: got nan; must be": lambda s, d: simulate(s, max_cost=math.nan),
+    "scene: got 'x'; must be a scene; such as": lambda s, d: hpgr.operating_gap("x", 4e6),
+    "specific_pressing_force: got None; must be": lambda s, d: hpgr.operating_gap(s, None),
+    "scene: got 'y'; must be a scene; such as": lambda s, d: hpgr.calibrate("y", None, "product", "operations"),
+    "scene: got 'z'; must be a scene; such as": lambda s, d: sweep("z", {"gap": [0.04]}),
+    "space: got None; must be fields": lambda s, d: sweep(s, None),
+    "tolerance: got 2; must be": lambda s, d: sweep(s, {"gap": [0.04]}, tolerance=2),
+    "max_cost: got -1; must be": lambda s, d: sweep(s, {"gap": [0.04]}, max_cost=-1),
+    "timeout: got 'x'; must be within 0.1 to 1e6 s": lambda s, d: sweep(s, {"gap": [0.04]}, timeout="x"),
+    "percent: got '80'; must be within 0 to 100; such as percent=80": lambda s, d: hpgr.percentile_size(d, "80"),
+    "percent: got None; must be": lambda s, d: hpgr.reduction_ratio(d, None),
+    "point: got 1.5; must be a whole number": lambda s, d: hpgr.passing(d, ["1 mm"], point=1.5),
+    "dataset: got 3; must be a Dataset; such as": lambda s, d: hpgr.passing(3),
+    "dataset: got 4; must be a Dataset; such as": lambda s, d: hpgr.throughput(4),
+    "dataset: got 5; must be a Dataset; such as": lambda s, d: hpgr.peak_pressure(5),
+    "dataset: got 6; must be a Dataset; such as": lambda s, d: hpgr.reduction_ratio(6),
+    "dataset: has no 'throughput'; must be": lambda s, d: hpgr.throughput(d.drop_vars("throughput")),
+}
+
+
+@pytest.fixture(scope="module")
+def small():
+    scene = paper({"resolution.cells": 8})
+    return scene, simulate(scene)
+
+
+@pytest.mark.parametrize("words", NO_ARGUMENTS)
+def test_what_is_no_argument_is_refused_by_its_name(small, words):
+    with pytest.raises((TypeError, ValueError), match=f"^{re.escape(words)}"):
+        NO_ARGUMENTS[words](*small)
+
+
 # --- the one door ------------------------------------------------------------------------------------------
 
 HELD = {"rolls.specific_pressing_force": "4 N/mm^2", "resolution.cells": 0}
@@ -459,8 +498,6 @@ HELD = {"rolls.specific_pressing_force": "4 N/mm^2", "resolution.cells": 0}
 
 def test_every_caller_runs_the_machine_whose_gap_carries_the_force():
     """55.0 mm and 3.83 N/mm2 are the machine as given; 53.7 mm carries 4.00."""
-    from studies.sweep import sweep
-
     scene = plain_industrial().with_values(HELD)
     result = run_scene(scene)
     assert result.scene.rolls.gap == pytest.approx(53.78e-3, abs=1e-5)

@@ -12,7 +12,7 @@ import numpy as np
 
 from hpgr.bed.loaded import BedInputs, Pressed, bear, force_on_roll, inputs_of
 from hpgr.fields import show
-from hpgr.scene import LEAST_GAP, STEEPEST_ENTRY, Scene
+from hpgr.scene import LEAST_GAP, STEEPEST_ENTRY, Scene, check_scene
 
 _NARROWEST = 1e-4  # gap over diameter below which no operating gap is looked for
 _PRECISION = 1e-9  # relative, of the force that an operating gap is found for
@@ -84,8 +84,10 @@ def operating_gap(scene: Scene, specific_pressing_force: float | str) -> float:
 
     Raises
     ------
+    TypeError
+        If `scene` is none.
     ValueError
-        If no gap carries that force; the message has the reachable range.
+        If the force is none, or no gap carries it; the message has the reachable range.
 
     Examples
     --------
@@ -95,6 +97,9 @@ def operating_gap(scene: Scene, specific_pressing_force: float | str) -> float:
     >>> 0.01 < narrow < wide < 0.1
     True
     """
+    check_scene(scene)
+    if specific_pressing_force is None:  # which a scene may have, as its gap is then its own
+        raise ValueError("specific_pressing_force: got None; must be a pressure; such as '3.5 N/mm^2'")
     held = scene.with_values({"rolls.specific_pressing_force": specific_pressing_force})
     return float_gap(held).rolls.gap
 

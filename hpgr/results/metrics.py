@@ -5,11 +5,12 @@ All stream tubes carry equal mass, so the whole gap is their plain mean (model p
 """
 
 import json
+import numbers
 
 import numpy as np
 import xarray as xr
 
-from hpgr.fields import parse
+from hpgr.fields import check_number, parse
 from hpgr.results.schema import Variable
 from hpgr.scene import Scene
 
@@ -83,8 +84,7 @@ def percentile_size(dataset: xr.Dataset, percent: float, point: int = -1, total:
     True
     """
     _require_sizes(dataset, point)
-    if not 0 <= percent <= 100:
-        raise ValueError(f"percent: got {percent}; must be within 0 to 100; P80 is percent=80")
+    check_number("percent", percent)
     name = f"p{percent:g}" + ("_total" if total else "")
     if _is_exit(dataset, point) and name in dataset:
         return dataset[name]
@@ -110,6 +110,7 @@ def throughput(dataset: xr.Dataset, total: bool = False) -> xr.DataArray:
     >>> hpgr.throughput(dataset).dims
     ('streamline',)
     """
+    _require(dataset, "throughput")
     if total:
         return dataset["throughput"]
     share = dataset["throughput"] / dataset.sizes["streamline"]
@@ -131,6 +132,7 @@ def peak_pressure(dataset: xr.Dataset, total: bool = False) -> xr.Dataset:
     26.5
     """
     names = ("peak_pressure", "peak_pressure_height")
+    _require(dataset, *names)
     return xr.Dataset({name: dataset[name if total else f"streamline_{name}"] for name in names})
 
 
@@ -151,6 +153,8 @@ def reduction_ratio(dataset: xr.Dataset, percent: float = 80, total: bool = Fals
     >>> 25 < float(hpgr.reduction_ratio(dataset, 80, total=True)) < 40
     True
     """
+    check_number("percent", percent)
+    _require(dataset)
     swept = [name for name, axis in dataset.coords.items() if axis.attrs.get("scene_field", "").startswith("feed.")]
     if swept:
         raise ValueError(
@@ -199,9 +203,22 @@ def _sizes(sieves) -> np.ndarray:
     return found
 
 
+def _require(dataset: xr.Dataset, *names: str) -> None:
+    if not isinstance(dataset, xr.Dataset):
+        raise TypeError(f"dataset: got {dataset!r:.80}; must be a Dataset; such as hpgr.simulate(scene)")
+    missing = [name for name in names if name not in dataset]
+    if missing:
+        raise ValueError(
+            f"dataset: has no {missing[0]!r}; must be of hpgr.simulate or a study; such as hpgr.simulate(scene)"
+        )
+
+
 def _require_sizes(dataset: xr.Dataset, point: int) -> None:
+    _require(dataset)
     if "passing" not in dataset:
         raise ValueError("the Dataset holds no sizes: it is stress only (resolution.cells = 0); simulate it with cells")
+    if not isinstance(point, numbers.Integral):
+        raise ValueError(f"point: got {point!r}; must be a whole number; take -1 for the exit")
     points = dataset.sizes.get("point")
     if points is not None and not -points <= point < points:
         raise ValueError(

@@ -11,8 +11,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from hpgr.fields import check_seed
-from hpgr.scene import Scene
+from hpgr.fields import check_number, check_seed
+from hpgr.scene import Scene, check_scene
 from studies.sweep.space import Space, SweepSpec, axes_of
 
 if TYPE_CHECKING:
@@ -89,6 +89,8 @@ def sweep(
 
     Raises
     ------
+    TypeError
+        If `scene` is none.
     ValueError
         If there is no such scene field, or it has no or doubled values, or one that it refuses; if cases are to be
         recorded whole and no folder is given.
@@ -104,6 +106,7 @@ def sweep(
     >>> dict(result["p80_total"].sizes)
     {'gap': 2, 'replicate': 2}
     """
+    check_scene(scene)
     space = Space(axes_of(space), replicates)
     if "rolls.gap" in space.fields and (
         "rolls.specific_pressing_force" in space.fields
@@ -116,13 +119,14 @@ def sweep(
     for name, value in {"replicates": replicates, "threads": threads}.items():
         if not isinstance(value, numbers.Integral) or value < 1:
             raise ValueError(f"{name}: got {value!r}; must be a whole number, at least 1; such as {name}=2")
-    if timeout is not None and not 0.1 <= timeout <= 1e6:
-        raise ValueError(f"timeout: got {timeout:g}; must be 0.1 to 1,000,000 s; such as timeout=60")
+    for name, value in {"tolerance": tolerance, "max_cost": max_cost, "timeout": timeout}.items():
+        if value is not None:
+            check_number(name, value)
+    base = scene.with_values({"resolution.record": record})
     if record != "product" and folder is None:
         raise ValueError(f"folder: got None; record={record!r} needs a folder, which takes a file of each case")
     from studies.sweep import assemble, cases, isolated, run
 
-    base = scene.with_values({"resolution.record": record})
     spec = SweepSpec(base, seed, tolerance, max_cost, timeout, cases.code_version())
     task = run.run_batch if timeout is None else isolated.run_isolated
     with ExitStack() as stack:

@@ -227,6 +227,10 @@ def axes_of(space: "Mapping[Any, Any] | xr.Dataset") -> dict[str, Axis]:
     ValueError
         Naming the field, the value and the remedy.
     """
+    if not isinstance(space, Mapping):
+        raise ValueError(
+            f"space: got {space!r:.80}; must be fields and their values; such as {{'gap': ['40 mm', '60 mm']}}"
+        )
     axes: dict[str, Axis] = {}
     for name, values in _given(space):
         if name == SCENE:
