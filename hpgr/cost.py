@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import psutil
 
-from hpgr.grains.solve import choose
+from hpgr.grains.solve import choose, is_controlled
 from hpgr.scene import Scene
 
 _SHARE = 0.8  # of the available memory that one scene may take; the rest is for the reader of the result
@@ -47,8 +47,9 @@ def predict(scene: Scene) -> Cost:
         seconds += time * (columns + 0.5 * everywhere)
     elif cells:
         product = grid.snapshots * columns * cells
-        at_once = max(os.cpu_count() or 1, 200_000 // cells)  # parcels, see hpgr.grains.march
+        at_once = (os.cpu_count() or 1) * max(20_000 // cells, 1)  # parcels, see hpgr.grains.march
         size += (12 if slices == 1 else 38) * product  # kept, pooled, sorted; with slices ordered by their shares
+        size += 8 * product if is_controlled(scene) else 0  # what cells come to without cushioning, kept and pooled
         size += 40 * cells * min(columns * grid.snapshots, at_once)  # work space
         seconds += product * (0.2e-6 + 0.15e-9 * points)
     if solver.endswith("lattice"):
