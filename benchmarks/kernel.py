@@ -4,17 +4,23 @@ Run by hand, from the root of the repository: `python -m benchmarks.kernel`. Abo
 Every repeat marches fresh copies of the same cells along the central streamline, all in one process.
 """
 
+import ast
 import functools
+import inspect
 import math
 import os
 import platform
 import statistics
+import textwrap
 import time
 from pathlib import Path
 
 import numba
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 from hpgr import presets
 from hpgr.bed.loaded import inputs_of, load_bed
@@ -138,6 +144,54 @@ def floor(line, n):
     return march_of_known_breaks, len(places) / cells
 
 
+@intrinsic
+def _cycles(typing_context):
+    def generate(context, builder, signature, values):
+        kind = ir.FunctionType(ir.IntType(64), [])
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.readcyclecounter"), [])
+
+    return types.int64(), generate
+
+
+def measured_crush():
+    """Return the kernel with a clock after every statement of its step, which adds to ticks, and what they call."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(kernels.crush.py_func)))
+    function = tree.body[0]
+    function.decorator_list, arguments = [], function.args.args
+    arguments.append(ast.arg("ticks"))
+    step = next(part for part in ast.walk(function) if isinstance(part, ast.If) and "np.inf" in ast.unparse(part.test))
+    called = [
+        [call.func.id for call in ast.walk(part) if isinstance(call, ast.Call) and isinstance(call.func, ast.Name)]
+        for part in step.body
+    ]
+    clock = "now = _cycles()\nticks[{0}] += now - then\nthen = now"
+    body = ast.parse("then = _cycles()").body
+    for k, part in enumerate(step.body):
+        body += [part, *ast.parse(clock.format(k)).body]
+    step.body = body
+    names = vars(kernels) | {"_cycles": _cycles}
+    exec(compile(ast.fix_missing_locations(tree), "measured", "exec"), names)
+    return njit(nogil=True, error_model="numpy")(names["crush"]), called
+
+
+def shares(points, cells, n):
+    """Return the part of the march's time that each loop of a step takes, by its name."""
+    crush, called = measured_crush()
+    scene, laws = ore(n)
+    parcels, log_stress = case(points, cells)
+    one, ticks = np.zeros(1, int), np.zeros(len(called), np.int64)
+    passage = kernels.Passage(one, one, one, one + points)
+    work, path = kernels.make_work(cells), march.path(scene, log_stress)
+    for _ in range(3):
+        ticks[:] = 0  # of the first, which compiles
+        crush(copied(parcels), passage, path, laws, work, kernels.Record(), ticks)
+    found = {}
+    for names, spent in zip(called, ticks, strict=True):
+        loop = next((name for name in names if name.startswith("_")), "the rest")
+        found[loop] = found.get(loop, 0.0) + spent / ticks.sum()
+    return found
+
+
 @njit
 def _read(bits, times):
     total = 0
@@ -241,6 +295,13 @@ def main():
             least, now = (statistics.median(timed(each, line, cells, n, REPEATS)) for each in (known, bounded))
             print(f"| {n} | {cells:,} | {breaks:.2f} | {least:.0f} | {now:.0f} | {now / least:.2f} |", flush=True)
     print(f"\nns per cell at {PLAIN_POINTS} points; the floor knows which cells break, and decides {DECIDED} a break\n")
+
+    found = [shares(points, CELLS[1], 1.0) for points in (200, 1600)]
+    print("| loop of a step | 200 points | 1,600 points |")
+    print("|---|---|---|")
+    for loop in sorted((loop for loop in found[0] if found[0][loop] > 5e-3), key=found[0].get, reverse=True):
+        print(f"| {loop} | " + " | ".join(f"{each[loop]:.0%}" for each in found) + " |")
+    print(f"\nshares of the time of a march, n = 1, {CELLS[1]:,} cells\n", flush=True)
 
     print("| cells | read | compare | one compare of every cell at every one of 1,600 points |")
     print("|---|---|---|---|")
