@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import numpy as np
 
 from hpgr import presets
+from hpgr.fields import values_of
 from hpgr.scene import Scene
 from studies.command import Flag, Out, Overwrite, Plot, Report, SceneName, base_scene, command, figure, shown_as
 
@@ -179,20 +180,14 @@ def _models(
     found = calibration.validated(found) if len(known) > 2 else found
     fitted = [calibration.PARAMETERS[name] for name in found.problem.names]
     fields = [field for one in fitted for field in (one.field, one.follower) if field]
-    drawn = found.sample(_SAMPLES, seed=0)
-    samples = {name: np.array([_field(one, name) for one in drawn]) for name in fields}
+    drawn = [values_of(one) for one in found.sample(_SAMPLES, seed=0)]
+    samples = {name: np.array([one[name] for one in drawn]) for name in fields}
     models = [Model("hpgr", found.predict, str(found))]
     if baselines:
-        for name, predict, told in _baselines(scene, known):
-            models.append(Model(name, predict, told))
+        models += _baselines(scene, known)
     remark = f"fitted to {', '.join(test.name for test in known)}"
     fitted_scene = found.scene.with_values({"resolution.sieves": scene.resolution.sieves, "remark": remark})
     return models, fitted_scene, samples
-
-
-def _field(scene: Scene, name: str) -> float:
-    part, key = name.split(".")
-    return getattr(getattr(scene, part), key)
 
 
 def _baselines(scene: Scene, known: Sequence[Any]) -> Iterable[Model]:
@@ -246,25 +241,19 @@ def comparison(scene: Scene, tests: Sequence[Any], baselines: bool) -> "xr.Datas
                 continue
             values[k, out] = [_errors(found).get(error, math.nan) for error in _ERRORS]
         print(name, *(f"{median:.2f}/{largest:.2f}" for median, largest in values[k, :, :2]), flush=True)
-    names = np.array(["measured", *(name for name, _ in named)], object)
+    names = ["measured", *(name for name, _ in named)]
     figures = [f"{name}: {words} [{unit}]" for name, (unit, words) in _ERRORS.items()]
     own = schema.Variable
+    told = "error by combination of laws", "; ".join(figures)
     table = {
-        "error": own(
-            ("laws", "left_out", "figure"), "", "error by combination of laws", "; ".join(figures), np.float64
-        ),
+        "error": own(("laws", "left_out", "figure"), "", *told, np.float64),
         "constants": own(("laws",), "1", "number of fitted constants", dtype=np.int32),
         "laws": own(("laws",), "", "combination of laws", dtype=object),
         "left_out": own(("left_out",), "1", "tests left out at a time; 0: errors of the fit", dtype=np.int32),
         "figure": own(("figure",), "", "figure of merit", dtype=object),
     }
-    data = {
-        "error": values,
-        "constants": constants,
-        "laws": names,
-        "left_out": range(3),
-        "figure": np.array(list(_ERRORS), object),
-    }
+    data = {"error": values, "constants": constants, "left_out": range(3)}
+    data |= {"laws": np.array(names, object), "figure": np.array(list(_ERRORS), object)}
     attrs = schema.dataset_attributes("Combinations of laws against pilot tests", scene=scene.model_dump_json())
     return schema.to_dataset(data, attrs, table)
 
@@ -368,21 +357,8 @@ def compared(result: "xr.Dataset") -> str:
                 row.append(f"{_figure(at['coverage'], '.0f')}, {_figure(at['width'], '.1f')}")
         row += [_figure(one.sel(left_out=0, figure=key).item(), ".2f") for key in ("gap_exponent", "energy_exponent")]
         rows.append(row)
-    headings = [
-        "laws",
-        "n",
-        "fit",
-        "leave 1 out",
-        "centre",
-        "edge",
-        "Q [%]",
-        "P [%]",
-        "W [%]",
-        "inside, width [%]",
-        "leave 2 out",
-        "gap exp.",
-        "W exp.",
-    ]
+    headings = ["laws", "n", "fit", "leave 1 out", "centre", "edge", *(f"{name} [%]" for name in "QPW")]
+    headings += ["inside, width [%]", "leave 2 out", "gap exp.", "W exp."]
     return aligned(headings, rows, words=1)
 
 

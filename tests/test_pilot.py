@@ -88,7 +88,7 @@ def test_tests_that_the_model_has_made_are_predicted_blind(written, capsys):
     assert (xr.open_dataset("outputs/pilot.nc").attrs["models"]).startswith("hpgr: calibrated on A, B")
 
 
-def test_a_sweep_takes_the_scene_and_the_samples_of_a_calibration(written, monkeypatch):
+def test_a_sweep_takes_the_scene_and_the_samples_of_a_calibration(written, monkeypatch, capsys):
     """Its middle is what the fitted scene gives; its bands hold the truth that made the tests."""
     from studies import feed_sweep, gap_sweep
     from studies.show.plots.bands import bands
@@ -97,7 +97,10 @@ def test_a_sweep_takes_the_scene_and_the_samples_of_a_calibration(written, monke
     assert main([*written, "--calibrate-on", "A", "B", *FIT, *GRID, "--no-baselines", "--no-plot"]) == 0
     few = ["--calibration", "outputs/pilot.nc", "--replicates", "1"]
     assert gap_sweep.main([*few, "--press-force", "2.5 N/mm^2", "4.7 N/mm^2"]) == 0
-    assert gap_sweep.main([*few, "--gap", "20 mm", "--out", "other"]) == 2  # the gap floats under the scene's force
+    capsys.readouterr()
+    assert gap_sweep.main([*few, "--dry-run"]) == 0
+    assert "press force" in capsys.readouterr().out  # the scene has one, under which the gap floats
+    assert gap_sweep.main([*few, "--gap", "20 mm", "--out", "other"]) == 2
     assert feed_sweep.main([*few, "--no-plot"]) == 0
     with xr.open_dataset("outputs/gap_sweep.nc") as result, xr.open_dataset("outputs/pilot.nc") as fitted:
         found = bands(result.load(), 1e-3)
