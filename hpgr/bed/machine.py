@@ -5,7 +5,7 @@ Real machines set force and speed, and the gap follows (model page, section Real
 
 import math
 from collections.abc import Callable
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -133,9 +133,7 @@ def _gap_carrying(inputs: BedInputs, wanted: float) -> float:
             f"{show(narrow, 'm')}, below which {below}; begin the bed higher"
         )
 
-    @cache
-    def force(log_gap: float) -> float:
-        return _force_over_diameter(inputs._replace(gap=math.exp(log_gap)))
+    force = _force_at(inputs)
 
     def excess(log_gap: float) -> float:  # nearly straight in logs; without any force it is far below
         return math.log(max(force(log_gap) / wanted, _NO_FORCE))
@@ -158,6 +156,15 @@ def _gap_carrying(inputs: BedInputs, wanted: float) -> float:
             f"{show(math.exp(found), 'm')}; choose a force outside, or elasticity.exponent above 0"
         )
     return math.exp(found)
+
+
+@lru_cache(16)
+def _force_at(inputs: BedInputs) -> Callable[[float], float]:
+    """Return the force over diameter and width, Pa, as a function of the log of the gap, m.
+
+    It keeps what it has found: of the nine gaps that a search takes the ends are the same for any force.
+    """
+    return lru_cache(64)(lambda log_gap: _force_over_diameter(inputs._replace(gap=math.exp(log_gap))))
 
 
 def _root(function: Callable[[float], float], low: float, high: float) -> float:
