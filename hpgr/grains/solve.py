@@ -209,8 +209,9 @@ def _summarised(
         control = Control(_pooled([cells.complete for cells in replicates], slices), exact)
         # not what is below the floor: a limit is hit by cells, not in the mean
         passing[..., 1:] = control.passing(counts[..., 1:], np.array(scene.resolution.sieves))
-        fractions = control.fractions(percentiles, [share for _, share in read])
-        percentiles = [_quantiles(*one, at) for one, at in zip(read, fractions, strict=True)]
+        for _ in range(2):  # the first read is off by the cells' own scatter, the second by little
+            fractions = control.fractions(percentiles, [share for _, share in read])
+            percentiles = [_quantiles(*one, at) for one, at in zip(read, fractions, strict=True)]
 
     def along_width(k: int) -> AlongWidth:
         each = passing[:, k, :, 1:].mean(axis=1)
