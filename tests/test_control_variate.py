@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from support import paper, sized
 
 from hpgr import passing, percentile_size, simulate
-from hpgr.grains import march, solve
+from hpgr.grains import kernels, march, solve
 from hpgr.laws.roll_width import WHOLE
 from hpgr.run import load
 
@@ -146,3 +146,35 @@ def test_replicates_at_once_are_those_one_by_one():
         [alone] = solve.crush(scene, bed, 7, [replicate])
         for name in ("passing", "percentiles", "total_percentiles", "breaks", "below_floor"):
             assert np.array_equal(getattr(alone, name), getattr(found, name)), name
+
+
+@pytest.mark.parametrize("values", SCENES.values(), ids=SCENES)
+def test_percentiles_and_passing_agree(values):
+    """Of a streamline, of the total: what passes the size read as P50 is half, but for a few cells."""
+    cells = sized(500, 100)
+    [found] = next(products(values, cells, replicates=1))
+    for k, fraction in enumerate(solve.FRACTIONS):
+        for sizes, passes in (
+            (found.percentiles[k, :1], lambda one: one.passing[0]),
+            (found.total_percentiles[k : k + 1], lambda one: one.passing.mean(axis=0)),
+        ):
+            [again] = next(products(values | {"resolution.sieves": sizes.tolist()}, cells, replicates=1))
+            assert passes(again)[0] == pytest.approx(fraction, abs=5 / cells)
+
+
+def test_exact_passing_is_corrected_by_counts():
+    counts, complete = np.array([[0, 0, 2, 8], [0, 3, 3, 8]]), np.array([[0, 1, 4, 8], [0, 4, 8, 8]])
+    exact = np.array([[0.05, 0.02], [0.2, 0.5], [0.4, 0.9], [1.0, 1.0]])
+    passing = np.empty(counts.shape)
+    kernels.correct_passing(counts, complete, passing, exact)
+    # below every cell the ratio is that of the next sieve; 3 / 4 x 0.5 is more than 3 / 8 x 0.9
+    wanted = [[0.0, 0.0, 0.2, 1.0], [0.75 * 0.02, 0.375, 0.375, 1.0]]
+    assert passing == pytest.approx(np.array(wanted))
+
+
+def test_quantiles_are_those_of_numpy():
+    rows = np.sort(np.random.default_rng(0).random((3, 17)).astype(np.float32), axis=1)
+    fractions, found = np.array([[0.0, 0.5, 0.3], [0.8, 1.0, 0.31]]), np.empty((2, 3))
+    kernels.quantiles(rows, fractions, found)
+    wanted = [[np.quantile(row.astype(float), at) for row, at in zip(rows, each, strict=True)] for each in fractions]
+    assert found == pytest.approx(np.array(wanted), rel=1e-12)
