@@ -266,12 +266,12 @@ class Column:
         """Return the number of swaps of `times` substeps, the places in equal shares."""
         swaps, cells = 0, self.sizes.shape[1]
         edges = Edges(self.pairs, self.rise, self.mixing, self.ceiling, np.arange(len(self.pairs)))
-        numbers, hits = np.empty(cells // 2 + 1, np.uint64), np.empty(cells, bool)
+        numbers, hits = np.empty(cells // 4 + 1, np.uint64), np.empty(cells, bool)
         for _ in range(times):
             before, key = self.sizes.copy(), next(self.keys)
             self.parcels.bounds_outdated[:] = False
             for part in np.array_split(np.arange(1, cells + 1), shares):
-                places = part[0], part[-1] + 1, numbers, numbers.view(np.int32), hits
+                places = part[0], part[-1] + 1, numbers, numbers.view(np.uint16), hits
                 swaps += kernels.swap(self.parcels, self.slots, edges, self.means, before.max(), key, *places)
             assert self.parcels.bounds_outdated[np.any(before != self.sizes, axis=1)].all()
         return swaps
@@ -455,7 +455,7 @@ def test_shares_of_the_places_do_not_know_of_each_other(mixing):
     edges = Edges(alone.pairs, alone.rise, alone.mixing, 0 * alone.rise, np.arange(len(RING)))
     numbers, key = np.empty(64, np.uint64), next(alone.keys)
     for first in (65, 1):
-        places = first, first + 64, numbers[:32], numbers[:32].view(np.int32), np.empty(64, bool)
+        places = first, first + 64, numbers[:17], numbers[:17].view(np.uint16), np.empty(64, bool)
         kernels.swap(alone.parcels, alone.slots, edges, alone.means, np.float32(sizes).max(), key, *places)
     assert np.array_equal(forward.sizes, alone.sizes)
     assert not np.array_equal(forward.sizes, np.float32(sizes))

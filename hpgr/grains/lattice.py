@@ -14,7 +14,7 @@ import numpy as np
 
 from hpgr.bed.loaded import LoadedBed
 from hpgr.grains import kernels, march
-from hpgr.grains.kernels import Edges, Passage, Record
+from hpgr.grains.kernels import Edges, Passage, Path, Record
 from hpgr.grains.march import Cells
 from hpgr.scene import Scene
 
@@ -133,8 +133,8 @@ def edges_of(scene: Scene, rates: SwapRates, means: np.ndarray) -> tuple[Edges, 
     substeps = substeps_needed(rates, mixing, means, scene.feed.largest_grain)
     most = int(substeps.max(initial=1))
     refuse_substeps(scene, rates, most)
-    numbers = np.arange(most + 1)[:, None] * substeps // most  # turns had so far; they are evenly spread
-    turns = np.nonzero(np.diff(numbers, axis=0))[1]
+    had = np.arange(most + 1)[:, None] * np.arange(most + 1) // most  # turns so far, of so many; evenly spread
+    turns = np.nonzero((np.diff(had, axis=0) > 0)[:, substeps])[1]
     return Edges(rates.pairs, rates.rise / substeps, mixing / substeps, rates.ceiling, turns), most
 
 
@@ -191,6 +191,7 @@ class Lattice:
         self._scene, self._rates, self._steady, self._each = scene, rates, steady, each
         self._seed, self._replicate = seed, replicate
         self._path, self._ore = march.path(scene, log_stress), march.ore(scene)
+        self._breaking = can_break(scene, self._path).ravel()
         cells, scattered = scene.resolution.cells, math.isfinite(scene.strength.scatter)
         self.parcels = kernels.make_parcels(log_stress.size, cells, scattered)
         self._works = [kernels.make_work(cells) for _ in range(os.cpu_count() or 1)]
@@ -206,8 +207,8 @@ class Lattice:
         self.slots = np.roll(self._home, step, axis=1)
         self._let_in(step)
         lines, points = np.divmod(np.arange(self.slots.size), self.slots.shape[1])
-        breaking = np.isfinite(self._path.critical_ratio.ravel())
-        self._crush(self.slots.ravel()[breaking], lines[breaking], points[breaking], points[breaking] + 1)
+        slots, lines, points = (part[self._breaking] for part in (self.slots.ravel(), lines, points))
+        self._crush(slots, lines, points, points + 1)
         self._swap(step)
 
     def sizes(self) -> np.ndarray:
@@ -256,16 +257,17 @@ class Lattice:
         """Swap cells across all edges, in as many substeps as keep the probabilities of a cell at 1/2."""
         slots, cells = self.slots.ravel(), self._scene.resolution.cells
         means = np.empty(slots.size)
-        kernels.measure(self.parcels.sizes, slots, means)
+        largest = self._scene.feed.largest_grain
+        kernels.measure(self.parcels.sizes, slots, largest, means)
         edges, most = edges_of(self._scene, self._rates, means)
         self.most_substeps = max(self.most_substeps, most)
         key = np.uint64(kernels.mix(np.uint64((self._swap_key + (step + 1) * 0xD1342543DE82EF95) % 2**64)))
-        largest = self._scene.feed.largest_grain
 
         def swap(first):
             last = min(first + _SHARE, cells + 1)
-            numbers, hits = np.empty((last - first + 1) // 2, np.uint64), np.empty(last - first, bool)
-            work = numbers, numbers.view(np.int32), hits
+            numbers = np.empty((last - first) // 4 + 1, np.uint64)
+            hits = None if self.parcels.weakness is None else np.empty(last - first, bool)
+            work = numbers, numbers.view(np.uint16), hits
             return kernels.swap(self.parcels, slots, edges, means, largest, key, first, last, *work)
 
         self.swaps += sum(self._each(swap, range(1, cells + 1, _SHARE)))
@@ -315,14 +317,17 @@ def settle(scene: Scene, rates: SwapRates, shape: tuple[int, int], first: int) -
     return Above(entering, swaps.sum(), most)
 
 
+def can_break(scene: Scene, path: Path) -> np.ndarray:
+    """Return whether anything can break at (streamline, point)."""
+    if math.isinf(scene.strength.scatter) and math.isfinite(scene.strength.weibull_modulus):
+        return path.critical_ratio <= scene.feed.largest_grain / scene.strength.reference_size * (1 + 1e-6)
+    return np.isfinite(path.critical_ratio)
+
+
 def first_break(scene: Scene, log_stress: np.ndarray) -> int:
     """Return the first point at which anything can break on any streamline; the number of points if none does."""
-    ratio = march.path(scene, log_stress).critical_ratio.min(axis=0)
-    if math.isinf(scene.strength.scatter) and math.isfinite(scene.strength.weibull_modulus):
-        breaking = ratio <= scene.feed.largest_grain / scene.strength.reference_size * (1 + 1e-6)
-    else:
-        breaking = np.isfinite(ratio)
-    return int(np.argmax(breaking)) if breaking.any() else ratio.size
+    breaking = can_break(scene, march.path(scene, log_stress)).any(axis=0)
+    return int(np.argmax(breaking)) if breaking.any() else breaking.size
 
 
 def run(
