@@ -372,8 +372,8 @@ class Scene(Frozen):
                 continue  # refused below
             data[name] = dict(part)
             kind = values.get(f"{name}.kind")
-            law = next((law for law in _parts(name) if kind in kinds_of(law)), None)
-            if law is not None:
+            law = kind and next((law for law in _parts(name) if kind in kinds_of(law)), None)
+            if law:
                 data[name] = {key: value for key, value in data[name].items() if key in law.model_fields}
         for name, value in values.items():
             section, _, key = name.partition(".")

@@ -96,7 +96,8 @@ def names(bits: int) -> list[str]:
 
 
 def _unusual_machine(run: Run) -> str:
-    rolls, given = run.scene.rolls, {name: _given(run.scene, usual.field) for name, usual in USUAL.items()}
+    given = {name: _given(run.scene, usual.field) for name, usual in USUAL.items() if usual.field}
+    rolls = run.scene.rolls
     values = given | {
         "surface speed": rolls.surface_speed,
         "specific pressing force": run.performance.specific_pressing_force,
@@ -104,7 +105,7 @@ def _unusual_machine(run: Run) -> str:
         "gap over diameter": rolls.gap / rolls.diameter,
         "exit solid fraction": float(run.bed.stress.solid_fraction[:, -1].mean()),
     }
-    told = ((name, values[name], usual, given[name]) for name, usual in USUAL.items())
+    told = ((name, values[name], usual, given.get(name)) for name, usual in USUAL.items())
     return "; ".join(
         f"{name} {show(value, usual.unit, 4)} (usual {show(usual.low, usual.unit)} to {show(usual.high, usual.unit)}"
         f"{_meant_otherwise(usual, value, field)})"

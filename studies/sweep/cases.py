@@ -110,11 +110,16 @@ def finished(spec: SweepSpec, space: Space, folder: Path) -> Counter[tuple[int, 
 def pack(header: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
     """Return a header and arrays as one checksummed record."""
     arrays = {name: np.asarray(value, order="C") for name, value in arrays.items()}
-    listed = [[name, value.dtype.newbyteorder("<").str, value.shape] for name, value in arrays.items()]
+    listed = [[name, _little(value.dtype).str, value.shape] for name, value in arrays.items()]
     text = json.dumps(header | {"arrays": listed}).encode()
-    payload = b"".join(value.astype(value.dtype.newbyteorder("<"), copy=False).tobytes() for value in arrays.values())
+    payload = b"".join(value.astype(_little(value.dtype), copy=False).tobytes() for value in arrays.values())
     head = _HEAD.pack(_MAGIC, len(text), len(payload), _checksum(text, payload))
     return head + _CRC.pack(zlib.crc32(head)) + text + payload
+
+
+@functools.cache  # making one takes as long as packing a scalar
+def _little(dtype: np.dtype) -> np.dtype:
+    return dtype.newbyteorder("<")
 
 
 def read_packed(file: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -314,6 +319,7 @@ class CaseFolder:
         self._sign = self.folder / netcdf.temporary_name(".driver")
         who = {"host": socket.gethostname(), "process": os.getpid(), "since": time.strftime("%Y-%m-%d %H:%M:%S")}
         self._sign.write_text(json.dumps(who) + "\n", encoding="utf-8")
+        self._claims = os.open(self._sign, os.O_WRONLY | os.O_APPEND)
 
     def __enter__(self):
         return self
@@ -322,6 +328,7 @@ class CaseFolder:
         try:
             self.flush()
         finally:
+            os.close(self._claims)
             self._sign.unlink(missing_ok=True)
             os.close(self._lock)  # and with it every lock
 
@@ -349,8 +356,7 @@ class CaseFolder:
             if not held:
                 return False
         self._held.add(address)
-        with self._sign.open("a", encoding="utf-8") as file:
-            file.write(address + "\n")
+        os.write(self._claims, f"{address}\n".encode())
         return True
 
     def _look(self) -> list[Driver]:
