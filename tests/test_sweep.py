@@ -296,6 +296,20 @@ def test_lost_task_loses_its_batch_only(base, client, good, monkeypatch):
     lost_only(result, good, (1, 0), "failed", "SystemError", "worker lost")
 
 
+@pytest.mark.parametrize(("cells", "together"), [(1, 1), (10**6, 3)])
+def test_replicates_run_as_one_as_far_as_memory_goes(base, client, good, monkeypatch, cells, together):
+    real, most = run.run_replicates, []
+
+    def run_replicates(scene, seed, replicates, beds):
+        most.append(len(replicates))
+        return real(scene, seed, replicates, beds)
+
+    monkeypatch.setattr(run, "run_replicates", run_replicates)
+    monkeypatch.setattr(run, "_TOGETHER", cells)
+    assert sweep(base, {"rolls.gap": GAPS}, replicates=4, client=client).identical(good)
+    assert max(most) == together  # of batches of three
+
+
 def test_every_case_lost(base, client):
     result = sweep(base, {"rolls.gap": ["1.2 m", "2 m"]}, client=client)
     assert (result["status"] == STATUS["refused"]).all()

@@ -30,6 +30,7 @@ _SUMMARY = {name: entry for name, entry in _KNOWN.items() if not {"point", "cell
 _AHEAD = 4  # batches in flight for each thread of the workers: enough that none waits for the driver
 _AHEAD_WHOLE = 2  # the same where cases are told whole, which takes memory
 _BATCH = 32  # cases a task holds at most: dask's cost of about 1 ms per task is then under 1 % of a case's
+_TOGETHER = 200_000  # cells of replicates run as one at most: more gain nothing, and take the memory of all
 _BATCH_SECONDS = 2.0  # predicted for a task at most, so that progress shows and little is lost with a worker
 _PREDICTED = 100  # operating points whose cost is predicted; that of more is scaled up
 _TICK = 0.2  # s between looks at what other drivers have finished
@@ -59,8 +60,11 @@ class Runner:
             self._values = None  # a refused scene must not be taken for the next replicate's
             self._prepare(values)
             self._values = values
-        results = run_replicates(self._scene, self.spec.seed, replicates, self._beds)
-        return [result._replace(values=result.values | self._chosen) for result in results]
+        grid = self._scene.resolution
+        step = max(1, _TOGETHER // max(1, grid.snapshots * grid.streamlines * grid.cells))
+        parts = (replicates[first : first + step] for first in range(0, len(replicates), step))
+        results = (run_replicates(self._scene, self.spec.seed, part, self._beds) for part in parts)
+        return [result._replace(values=result.values | self._chosen) for part in results for result in part]
 
     def _prepare(self, values: dict[str, Any]) -> None:
         spec = self.spec
