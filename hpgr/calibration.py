@@ -20,6 +20,7 @@ from hpgr.bed.loaded import Beds
 from hpgr.fields import show
 from hpgr.grains import solve
 from hpgr.laws.feed import Feed, TableFeed
+from hpgr.laws.flow import NipFlow, cake_nip_angle, densest_ratio
 from hpgr.run import load, run_scene
 from hpgr.scene import Scene, check_scene, field_info
 from hpgr.tables import PilotTest, read_pilot_tests
@@ -371,13 +372,16 @@ class _Problem:
 
     def slope(self, place: np.ndarray, k: int, test: PilotTest, at: Prediction) -> dict[str, np.ndarray]:
         """Return the derivatives of a prediction with number `k`, by a difference that stays within the bounds."""
-        step = _STEP * self.spreads()[k]
-        step = -step if place[k] + step > self.bounds()[1][k] else step
-        moved = place.copy()
-        moved[k] += step
-        said = self.predict(moved, test)
+        moved = self._moved(place, k)
+        said, step = self.predict(moved, test), moved[k] - place[k]
         names = [name for name in (*PARTS, *FIGURES, "gap") if getattr(at, name) is not None]
         return {name: (getattr(said, name) - getattr(at, name)) / step for name in names}
+
+    def _moved(self, place: np.ndarray, k: int) -> np.ndarray:
+        """Return the place with number `k` a step further, within its bounds."""
+        moved, step = place.copy(), _STEP * PARAMETERS[self.columns[k][0]].spread
+        moved[k] += -step if place[k] + step > self.bounds()[1][k] else step
+        return moved
 
     def residuals(self, place: np.ndarray) -> np.ndarray:
         """Return the weighted residuals of all tests, in units of a typical error."""
@@ -402,12 +406,8 @@ class _Problem:
 
     def slopes(self, place: np.ndarray) -> np.ndarray:
         """Return the derivatives (residual, number) by differences that stay within the bounds."""
-        here, high, columns = self.residuals(place), self.bounds()[1], []
-        for k, step in enumerate(_STEP * self.spreads()):
-            moved = place.copy()
-            moved[k] += -step if place[k] + step > high[k] else step
-            columns.append((self.residuals(moved) - here) / (moved[k] - place[k]))
-        return np.array(columns).T
+        here, moved = self.residuals(place), [self._moved(place, k) for k in range(place.size)]
+        return np.array([(self.residuals(one) - here) / (one[k] - place[k]) for k, one in enumerate(moved)]).T
 
     def minimise(self, place: np.ndarray, start: np.ndarray, free: list[int]) -> np.ndarray:
         """Return the place of the least squares over the free numbers, each drawn to its start by its spread."""
@@ -459,7 +459,7 @@ def _calibration(problem: _Problem, place: np.ndarray, slopes: np.ndarray, free:
         parameter, reach = PARAMETERS[name], 1.96 * math.sqrt(covariance[k, k])
         ends = [parameter.value(min(max(place[k] + side * reach, low[k]), high[k])) for side in (-1, 1)]
         estimates[labels[k]] = Estimate(parameter.value(place[k]), *ends, field_info(parameter.field).unit)
-    said = [(test, problem.predict(place, test)) for test in problem.tests]
+    said = [(test, _carried(problem, place, test)) for test in problem.tests]
     at_bound = np.minimum(place - low, high - place) < 1e-3 * (high - low)
     return Calibration(
         _at_test(problem.scene, problem.tests[0], problem.feed).with_values(problem.values(place, 0)),
@@ -472,6 +472,17 @@ def _calibration(problem: _Problem, place: np.ndarray, slopes: np.ndarray, free:
         problem,
         place,
     )
+
+
+def _carried(problem: _Problem, place: np.ndarray, test: PilotTest) -> Prediction:
+    try:
+        return problem.predict(place, test)
+    except ValueError as error:
+        rolls = _at_test(problem.scene, test, problem.feed).rolls
+        raise ValueError(
+            f"test {test.name}: found no values with which rolls of {show(rolls.diameter, 'm')} x "
+            f"{show(rolls.width, 'm')} carry its force ({error}); check the rolls, give D_mm and L_mm, or other laws"
+        ) from None
 
 
 def _one_machine(test: PilotTest, other: PilotTest) -> bool:
@@ -559,8 +570,13 @@ def _started(scene: Scene, names: Sequence[str], test: PilotTest, feed: Feed | N
     rolls, bed = here.rolls, here.bed
     through = test.throughput / (_SOLID * bed.solid_density * rolls.width * test.surface_speed)
     gap = next(one for one in (float(measured(test, "gap")[0]), through, _GAP * rolls.diameter) if not math.isnan(one))
-    densest = here.elasticity.densest(bed.max_solid_fraction)
-    narrowest, _ = here.flow.narrowest_gap(rolls.diameter, bed.feed_solid_fraction, densest)
+    densest, feed_solid = here.elasticity.densest(bed.max_solid_fraction), bed.feed_solid_fraction
+    if "alpha" in names:
+        solid = test.throughput / (gap * bed.solid_density * rolls.width * test.surface_speed)
+        solid = solid if feed_solid < solid < densest else _SOLID
+        angle = _nip_angle(here.flow, gap / rolls.diameter, feed_solid, solid, densest)
+        scene, here = (one.with_values({PARAMETERS["alpha"].field: angle}) for one in (scene, here))
+    narrowest, _ = here.flow.narrowest_gap(rolls.diameter, feed_solid, densest)
     values = {"rolls.gap": max(gap, 1.05 * narrowest), "rolls.specific_pressing_force": None, "resolution.cells": 0}
     here = here.with_values(values)
     if "K" in names:
@@ -580,6 +596,17 @@ def _started(scene: Scene, names: Sequence[str], test: PilotTest, feed: Feed | N
             strength = pressure * (critical / scene.strength.reference_size) ** slope
             scene = scene.with_values({"strength.reference_strength": min(max(strength, 1e4), 1e9)})
     return scene
+
+
+def _nip_angle(flow: NipFlow, gap: float, feed_solid: float, solid: float, densest: float) -> float:
+    """Return the nip angle, or that of a cake of fraction `solid` if it compacts nothing or too much.
+
+    The gap is in diameters.
+    """
+    kept = (1 - flow.slip) * (gap + 1 - math.cos(flow.nip_angle)) * math.cos(flow.nip_angle) / gap
+    if 1 < kept < densest / feed_solid:
+        return flow.nip_angle
+    return cake_nip_angle(gap, 1.0, min(solid / feed_solid, densest_ratio(gap, 1.0, flow.slip)), flow.slip)
 
 
 def _known_names(scene: Scene, fit: Sequence[str] | None) -> list[str]:

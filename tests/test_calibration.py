@@ -145,6 +145,26 @@ def test_any_moduli_will_do_to_start_from(pilot_tests, modulus):
     assert abs(found.residuals["K-P1"]["gap"]) < 15
 
 
+@pytest.mark.parametrize(
+    "values",
+    [{"flow.nip_angle": 0.087}, {"flow.nip_angle": 0.34}, {"flow.slip": 0.0}],
+    ids=["nothing compacted", "nip above the bed", "denser than rock"],
+)
+def test_any_nip_angle_will_do_to_start_from(pilot_tests, values):
+    tests = [pilot_tests["K-P1"], pilot_tests["K-P3"]]
+    found = fit_tests(start(values), tests)
+    for test in tests:
+        said = found.predict(test, intervals=False)
+        assert said.throughput == pytest.approx(test.throughput, rel=0.1)  # without slip 8 % off, wherever it starts
+        assert np.sqrt(np.nanmean((said.total - test.total) ** 2)) < 0.03
+
+
+def test_rolls_that_cannot_be_those_of_the_tests_are_named(pilot_tests):
+    wide = presets.paper().with_values({"resolution.streamlines": 1, "resolution.points": 40, "resolution.cells": 20})
+    with pytest.raises(ValueError, match="test K-P1: found no values with which rolls of 6000 mm x 1000 mm carry"):
+        fit_tests(wide, [pilot_tests["K-P1"], pilot_tests["K-P2"]])
+
+
 def test_samples_have_the_covariance_and_scenes_differ(pilot_tests):
     """A standard deviation of 400 draws is right to 3.5 %; four times that is 1 in 15,000."""
     found = fit_tests(start(), [pilot_tests["K-P1"], pilot_tests["K-P3"]], ["sigma_m", "gamma"])
