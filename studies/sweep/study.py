@@ -22,7 +22,7 @@ _DRAWS = 32  # samples of a calibration
 _ALIKE_CAPTION = (
     "Tests of one feed tell k, the scatter of strength, no better than this: with the k of each further scene the "
     "product of the seven tests is missed by 9 % more than with the preset's own, and what the feed does lies between "
-    "them as far as these tests tell. Another ore, fitted to a coarse feed, was missed by 2.5 to 3.1 percent passing "
+    "them as far as these tests tell. Another ore, fitted to a coarse feed, was missed by 2.5 to 2.7 percent passing "
     "on a finer one (docs/validation.md)."
 )
 
