@@ -189,7 +189,7 @@ def _fragment_exponent_held(run: Run) -> str:
     law, largest = run.scene.fragments, run.scene.feed.largest_grain
     if run.broken is None or not getattr(law, "size_exponent", 0.0):
         return ""
-    parents = (min(max(_critical_size(run), law.size_floor), largest), largest)
+    parents = sorted({min(max(_critical_size(run), law.size_floor), largest), largest})
     held = [size for size in parents if float(law.exponent_of(size)) in HELD]
     told = " and ".join(f"{float(law.exponent_of(size)):g} for parents of {show(size, 'm', 3)}" for size in held)
     return f"the exponent of fragments is held at {told}, beyond which no measurement reaches" if held else ""
