@@ -48,7 +48,7 @@ def predict(scene: Scene) -> Cost:
     elif cells:
         product = grid.snapshots * columns * cells
         at_once = (os.cpu_count() or 1) * max(20_000 // cells, 1)  # parcels, see hpgr.grains.march
-        size += (12 if slices == 1 else 38) * product  # kept, pooled, sorted; with slices ordered by their shares
+        size += (12 if slices == 1 else 62) * product  # kept, pooled, sorted; with slices ordered by their shares
         size += 8 * product if is_controlled(scene) else 0  # what cells come to without cushioning, kept and pooled
         size += 40 * cells * min(columns * grid.snapshots, at_once)  # work space
         seconds += product * (0.2e-6 + 0.15e-9 * points)

@@ -200,8 +200,9 @@ def _summarised(
     pooled = _pooled([cells.product for cells in replicates], slices)
     whole = np.sort(pooled.reshape(*pooled.shape[:2], 1, -1), axis=-1)  # all lines as those of one
     zones = [_zone(slices, at_edge) for at_edge in (False, True)] if scene.roll_width else []
-    read = [(pooled, slices.share), *((whole, share) for share in (slices.share, *zones))]
-    percentiles = [_quantiles(cells, share, _fractions(cells.shape[1:3])) for cells, share in read]
+    shares = [slices.share, slices.share, *zones]
+    mixed = [*_mixed(pooled, shares[:1]), *_mixed(whole, shares[1:])]
+    percentiles = [_quantiles(one, _fractions(one.sizes.shape[:2])) for one in mixed]
     below_floor = np.nextafter(scene.fragments.size_floor, 0.0)
     counts = _count(pooled, np.append(below_floor, march.cell_sieves(scene))[:, None])
     passing = counts / pooled.shape[-1]
@@ -210,8 +211,8 @@ def _summarised(
         # not what is below the floor: a limit is hit by cells, not in the mean
         passing[..., 1:] = control.passing(counts[..., 1:], np.array(scene.resolution.sieves))
         for _ in range(2):  # the first read is off by the cells' own scatter, the second by little
-            fractions = control.fractions(percentiles, [share for _, share in read])
-            percentiles = [_quantiles(*one, at) for one, at in zip(read, fractions, strict=True)]
+            fractions = control.fractions(percentiles, shares)
+            percentiles = [_quantiles(one, at) for one, at in zip(mixed, fractions, strict=True)]
 
     def along_width(k: int) -> AlongWidth:
         each = passing[:, k, :, 1:].mean(axis=1)
@@ -256,29 +257,51 @@ def _fractions(shape: tuple[int, ...]) -> np.ndarray:
     return fractions
 
 
-def _quantiles(cells: np.ndarray, share: np.ndarray, fractions: np.ndarray) -> np.ndarray:
-    """Return the quantiles of sorted cells (slice, replicate, line, cell) at fractions (fraction, replicate, line).
+class Mixed(NamedTuple):
+    """Cells of all slices together, each slice with its share of the mass.
 
-    Of one slice linear between cells as np.quantile's are; of several, each with its share of mass, the first size that
-    reaches the fraction.
+    Attributes
+    ----------
+    sizes : ndarray
+        (replicate, line, cell) sorted, m.
+    reached : ndarray or None
+        Mass fraction up to each cell; None of one slice.
     """
-    found = np.empty_like(fractions)
-    if share.size == 1:
-        of_rows = (part.reshape(len(fractions), -1) for part in (fractions, found))
-        kernels.quantiles(cells.reshape(-1, cells.shape[-1]), *of_rows)
-        return found
-    cells, share = cells[share > 0], share[share > 0]
-    for k, line in np.ndindex(fractions.shape[1:]):
-        found[:, k, line] = _weighted(cells[:, k, line], share, fractions[:, k, line])
+
+    sizes: np.ndarray
+    reached: np.ndarray | None = None
+
+
+def _mixed(cells: np.ndarray, shares: list[np.ndarray]) -> list[Mixed]:
+    """Return sorted cells (slice, replicate, line, cell) mixed by each of the shares."""
+    if cells.shape[0] == 1:
+        return [Mixed(cells[0])] * len(shares)
+    together = np.moveaxis(cells, 0, 2).reshape(*cells.shape[1:3], -1)
+    order = np.argsort(together, axis=-1)  # once: it costs more than all that is read
+    sizes, order = np.take_along_axis(together, order, axis=-1), order // cells.shape[-1]
+    found = []
+    for share in shares:
+        reached = share[order]
+        np.cumsum(reached, axis=-1, out=reached)  # np.quantile with weights takes twice the memory, three times as long
+        reached /= reached[..., -1:]
+        found.append(Mixed(sizes, reached))
     return found
 
 
-def _weighted(cells: np.ndarray, share: np.ndarray, fractions: np.ndarray) -> np.ndarray:
-    order = np.argsort(cells, axis=None)
-    reached = share[order // cells.shape[1]]
-    np.cumsum(reached, out=reached)  # np.quantile with weights takes twice the memory and three times as long
-    reached /= reached[-1]
-    return cells.ravel()[order[np.searchsorted(reached, fractions)]].astype(float)
+def _quantiles(mixed: Mixed, fractions: np.ndarray) -> np.ndarray:
+    """Return the quantiles at fractions (fraction, replicate, line).
+
+    Of one slice linear between cells as np.quantile's are; of several the first size that reaches the fraction.
+    """
+    found = np.empty_like(fractions)
+    if mixed.reached is None:
+        of_rows = (part.reshape(len(fractions), -1) for part in (fractions, found))
+        kernels.quantiles(mixed.sizes.reshape(-1, mixed.sizes.shape[-1]), *of_rows)
+        return found
+    for k, line in np.ndindex(fractions.shape[1:]):
+        places = np.searchsorted(mixed.reached[k, line], fractions[:, k, line])
+        found[:, k, line] = mixed.sizes[k, line, places]
+    return found
 
 
 class Control(NamedTuple):
