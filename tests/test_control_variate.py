@@ -107,6 +107,14 @@ def test_cells_run_on_to_what_they_come_to_without_cushioning(values):
     assert np.array_equal(found.complete, wanted.product)
 
 
+def test_fragments_nearly_as_large_as_their_parents_are_not_completed():
+    """Completion takes breaks in proportion to the exponent: 5 million a cell at its upper bound."""
+    for exponent, used in ((10.0, True), (10.1, False), (1e6, False)):
+        assert solve.is_controlled(paper({"fragments.exponent": exponent})) == used
+    result = simulate(paper(BASE | {"fragments.exponent": 1e6, "resolution.cells": 50}))
+    assert result.attrs["solver"] == "march"
+
+
 def test_little_cushioning_is_the_closed_form():
     """What every cell comes to without cushioning is known exactly, so little is left to chance."""
     corrected, plain = (

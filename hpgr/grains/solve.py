@@ -15,6 +15,7 @@ from hpgr.scene import Scene
 
 _AT_ONCE = 4000  # points whose closed form is taken at once: each takes up to 20 kB
 _TOGETHER = 50_000  # cells of the replicates crushed at once: with more, new memory costs a tenth of the time
+_CONTROLLED_EXPONENT = 10.0  # of fragments; completion takes breaks in proportion to it: seconds at 1e6
 _ROUNDED = 1 + 1.2e-7  # covers the rounding of a size to float32
 FRACTIONS = (0.5, 0.8)  # of the percentiles every product is summarised by
 
@@ -94,6 +95,7 @@ def is_controlled(scene: Scene) -> bool:
     """Return whether the product of the march is corrected by the closed form (docs/model.md, Solvers)."""
     strength = scene.strength
     known = math.isfinite(strength.cushioning) and math.isfinite(strength.weibull_modulus)
+    known = known and scene.fragments.exponent <= _CONTROLLED_EXPONENT
     return known and scene.resolution.control_variate and choose(scene) == "march"
 
 
