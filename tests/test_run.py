@@ -544,7 +544,7 @@ SMALL = {"resolution.streamlines": 2, "resolution.points": 31, "resolution.cells
 BASES = {
     "exchange": SMALL
     | {"exchange": {"record_startup": True, "interval": 7}, "resolution.record": "distributions"}
-    | {"fragments.size_floor": "2 mm", "fragments.size_exponent": 0.3},
+    | {"resolution.cells": 100, "fragments.size_floor": "2 mm", "fragments.size_exponent": 0.3},
     "nip": SMALL | {"flow": {"kind": "nip", "nip_angle": "12 deg"}, "rolls.specific_pressing_force": "0.2 N/mm^2"},
     "cake": SMALL | {"flow": {"kind": "nip", "cake_solid_fraction": 0.8}},
     "width": SMALL | {"roll_width": {"slices": 2}, "resolution.record": "product"},
