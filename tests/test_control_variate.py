@@ -178,6 +178,8 @@ def test_exact_passing_is_corrected_by_counts():
     # below every cell the ratio is that of the next sieve; 3 / 4 x 0.5 is more than 3 / 8 x 0.9
     wanted = [[0.0, 0.0, 0.2, 1.0], [0.75 * 0.02, 0.375, 0.375, 1.0]]
     assert passing == pytest.approx(np.array(wanted))
+    kernels.correct_passing(0 * counts, 0 * complete, passing, exact)  # every cell is coarser than every sieve
+    assert np.array_equal(passing, exact.T)
 
 
 def test_quantiles_are_those_of_numpy():

@@ -322,10 +322,11 @@ def quantiles(rows, fractions, found):
 def correct_passing(counts, complete, passing, exact):
     """Fill passing (row, sieve): the exact one (sieve, row) times counts over those of the complete product.
 
-    Where no cell of the latter passes, the ratio is that of the next coarser sieve: 0 would be too little in the mean.
+    Where no cell of the latter passes, the ratio is that of the next coarser sieve, 1 above all: 0 would be too little
+    in the mean.
     """
     for k in range(counts.shape[0]):
-        ratio = 0.0
+        ratio = 1.0
         for m in range(counts.shape[1] - 1, -1, -1):
             if complete[k, m] > 0:
                 ratio = counts[k, m] / complete[k, m]
