@@ -26,7 +26,8 @@ def unpack() -> None:
             f"'git fetch --unshallow' ({archive.stderr.decode().strip()})"
         )
     with tarfile.open(fileobj=BytesIO(archive.stdout)) as packed:
-        packed.extractall(FOLDER, filter="data")
+        packed.extractall(FOLDER.with_suffix(".part"), filter="data")
+    FOLDER.with_suffix(".part").rename(FOLDER)  # whole, or not there
 
 
 class Before:
