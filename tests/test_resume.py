@@ -315,8 +315,9 @@ def drive(to):
     try:
         # a case recorded whole is a file of its own, and takes longer
         result = sweep(base, AXES_KILLED, 4 if record == "product" else 1, seed=2, folder=to, record=record)
-        with open(to + ".digest", "w") as file:
+        with open(to + ".part", "w") as file:
             file.write(digest(result))
+        os.replace(to + ".part", to + ".digest")  # whole, or not there
     finally:
         os._exit(0)
 
