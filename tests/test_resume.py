@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -203,7 +204,8 @@ def test_interrupt_ends_in_one_line_and_the_same_command_goes_on(tmp_path):
         "5000",
         "--no-plot",
     ]
-    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as driver:
+    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # what is started in the background may ignore it
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, preexec_fn=heard) as driver:
         while not list(tmp_path.rglob("*.seg")):
             assert driver.poll() is None
             time.sleep(0.05)
