@@ -116,6 +116,7 @@ def test_constants_of_machine_and_feed_are_each_groups_own_and_idle_power_is_tak
     assert again.power - bare.power == pytest.approx(5e3, rel=1e-6)
 
 
+@pytest.mark.plumbing
 def test_what_tests_do_not_tell_is_left_at_its_start_and_named(pilot_tests):
     """The total product alone: nothing of throughput, power and gap tells of K and alpha."""
     bare = np.full(13, math.nan)
@@ -150,6 +151,7 @@ def test_any_moduli_will_do_to_start_from(pilot_tests, modulus):
     [{"flow.nip_angle": 0.087}, {"flow.nip_angle": 0.34}, {"flow.slip": 0.0}],
     ids=["nothing compacted", "nip above the bed", "denser than rock"],
 )
+@pytest.mark.plumbing
 def test_any_nip_angle_will_do_to_start_from(pilot_tests, values):
     tests = [pilot_tests["K-P1"], pilot_tests["K-P3"]]
     found = fit_tests(start(values), tests)
@@ -159,6 +161,7 @@ def test_any_nip_angle_will_do_to_start_from(pilot_tests, values):
         assert np.sqrt(np.nanmean((said.total - test.total) ** 2)) < 0.03
 
 
+@pytest.mark.plumbing
 def test_rolls_that_cannot_be_those_of_the_tests_are_named(pilot_tests):
     wide = presets.paper().with_values({"resolution.streamlines": 1, "resolution.points": 40, "resolution.cells": 20})
     with pytest.raises(ValueError, match="test K-P1: found no values with which rolls of 6000 mm x 1000 mm carry"):

@@ -580,6 +580,7 @@ def other_value(name, value):
     return value + 1 if isinstance(value, int) else 3.0 if math.isinf(value) else 0.95 * value or 0.5
 
 
+@pytest.mark.plumbing
 def test_no_field_of_a_scene_is_forgotten():
     """Each is changed in turn: bed, address of a finished case, and result react, unless it is of those listed."""
     from studies.sweep.cases import Addresses

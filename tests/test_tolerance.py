@@ -95,6 +95,7 @@ def test_true_error_is_within_the_stated_one_on_random_scenes(scenes, count):
     assert refused <= 3
 
 
+@pytest.mark.plumbing
 def test_pilot_cells_are_never_undercut_and_the_feeds_own_cells_count():
     """A scene that hardly breaks: its scatter over replicates is that of the feed's strata, which may vanish."""
     weak = hpgr.presets.industrial().with_values(
