@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import psutil
 
+from hpgr.grains.march import AT_ONCE
 from hpgr.grains.solve import choose, is_controlled
 from hpgr.scene import Scene
 
@@ -47,7 +48,7 @@ def predict(scene: Scene) -> Cost:
         seconds += time * (columns + 0.5 * everywhere)
     elif cells:
         product = grid.snapshots * columns * cells
-        at_once = (os.cpu_count() or 1) * max(20_000 // cells, 1)  # parcels, see hpgr.grains.march
+        at_once = (os.cpu_count() or 1) * max(AT_ONCE // cells, 1)  # parcels
         size += (12 if slices == 1 else 62) * product  # kept, pooled, sorted; with slices ordered by their shares
         size += 8 * product if is_controlled(scene) else 0  # what cells come to without cushioning, kept and pooled
         size += 40 * cells * min(columns * grid.snapshots, at_once)  # work space

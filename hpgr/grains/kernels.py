@@ -714,7 +714,6 @@ def complete(sizes, streams, weakness, critical_ratios, exponent, ore):
     before would have broken without cushioning too, into the same fragments: what is left are the breaks that it held,
     3 % of all in the paper's scene.
     """
-    inverse_size = 1.0 / ore.reference_size
     for k in range(critical_ratios.size):
         critical = critical_ratios[k]
         surely_below = np.float32(critical * ore.reference_size * 0.999999)
@@ -724,7 +723,7 @@ def complete(sizes, streams, weakness, critical_ratios, exponent, ore):
                 weak = np.float64(weakness[k, p])
             elif size < surely_below:  # halves the time
                 continue
-            while size * inverse_size * weak >= critical and size >= ore.size_floor:
+            while size * ore.inverse_size * weak >= critical and size >= ore.size_floor:
                 streams[k, p] += _GOLDEN
                 ratio = uniform(streams[k, p])
                 if exponent is not None:

@@ -17,7 +17,7 @@ from hpgr.laws.roll_width import Slices
 from hpgr.scene import Scene
 
 _LARGE = 200_000  # cells of all parcels from which they are crushed on all cores
-_AT_ONCE = 20_000  # cells of the parcels of a call, whose work space then stays in cache
+AT_ONCE = 20_000  # cells of the parcels of a call, whose work space then stays in cache
 
 
 class Cells(NamedTuple):
@@ -148,7 +148,7 @@ def march(
             kernels.complete(*parcels[:3], critical, laws.inverse_exponent, laws)
             ends[part] = parcels.sizes[:, 1:-1]
 
-    step = max(_AT_ONCE // grid.cells, 1)
+    step = max(AT_ONCE // grid.cells, 1)
     with cores(product.size) as each:
         list(each(crush, [slice(k, k + step) for k in range(0, len(columns), step)]))
     found = product, breaks, record.snapshots, record.classes, ends

@@ -26,7 +26,7 @@ class Run(NamedTuple):
     bed: LoadedBed
     performance: Performance
     broken: bool | None  # whether any grain broke; None where there are none
-    below_floor: bool  # whether any of the product is below the size floor
+    below_floor: float  # mass fraction of the product below the size floor
 
 
 class Flag(NamedTuple):
@@ -69,18 +69,15 @@ def diagnose(
     """Return for each product of a bed, by flag, a sentence for each limit that its run hit."""
 
     @cache  # replicates hardly ever differ
-    def found(broken: bool | None, below_floor: bool) -> dict[str, str]:
+    def found(broken: bool | None, below_floor: float) -> dict[str, str]:
         run = Run(scene, bed, performance, broken, below_floor)
         hits = ((flag, flag.hit(run)) for flag in FLAGS)
         return {flag.name: words if isinstance(words, str) else flag.meaning for flag, words in hits if words}
 
-    def told(crushed: Crushed) -> dict[str, str]:
-        below = float(crushed.below_floor.mean())
-        limits = found(bool(crushed.breaks.any()), below > 0)
-        words = f"{below:.3g} of the product is below the size floor, where nothing breaks"
-        return limits | {"size_floor_reached": words} if below else limits
-
-    return [found(None, False) if crushed is None else told(crushed) for crushed in products]
+    return [
+        found(None, 0.0) if one is None else found(bool(one.breaks.any()), float(one.below_floor.mean()))
+        for one in products
+    ]
 
 
 def names(bits: int) -> list[str]:
@@ -195,6 +192,11 @@ def _fragment_exponent_held(run: Run) -> str:
     return f"the exponent of fragments is held at {told}, beyond which no measurement reaches" if held else ""
 
 
+def _size_floor_reached(run: Run) -> str:
+    words = f"{run.below_floor:.3g} of the product is below the size floor, where nothing breaks"
+    return words if run.below_floor else ""
+
+
 FLAGS = (  # in the order in which they are told
     Flag("unusual_machine", 128, "machine, ore or operation outside usual ranges", _unusual_machine),
     Flag("no_compaction", 2, "nothing is compacted: the product is the feed", _no_compaction),
@@ -206,7 +208,7 @@ FLAGS = (  # in the order in which they are told
     Flag("no_breakage", 1, "no grain broke: the product is the feed", lambda run: run.broken is False),
     Flag("feed_below_critical", 1024, "part of the feed is finer than any stress breaks", _feed_below_critical),
     Flag("fragment_exponent_held", 2048, "the exponent of fragments left its range", _fragment_exponent_held),
-    Flag("size_floor_reached", 16, "part of the product is below the size floor", lambda run: run.below_floor),
+    Flag("size_floor_reached", 16, "part of the product is below the size floor", _size_floor_reached),
     Flag("few_cells", 32, "of 2 or 3 cells each neighbours every other; use more", _few_cells),
 )
 BITS = {flag.name: flag.bit for flag in sorted(FLAGS, key=lambda flag: flag.bit)}
