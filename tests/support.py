@@ -78,6 +78,11 @@ def plain_industrial():
     return presets.industrial().with_values(_PAPERS_LAWS | {"rolls.gap": 0.055, "rolls.entry_gap": 0.15})
 
 
+def unmeasured(test, *names):
+    """Return a pilot test of which these were not measured."""
+    return test._replace(**{name: getattr(test, name) * math.nan for name in names})
+
+
 def paper(values=None):
     """Return the paper's scene in a small resolution, with other values by dotted name."""
     small = {"resolution.streamlines": 3, "resolution.points": 61, "resolution.cells": 64}

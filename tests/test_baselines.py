@@ -6,6 +6,7 @@ from importlib.resources import files
 import numpy as np
 import pytest
 from scipy import integrate, linalg
+from support import unmeasured
 
 from hpgr import baselines, presets, tables
 from hpgr.baselines import Fit, HindeKalala, HindeKalalaModel, Machine, TorresCasali, TorresCasaliModel
@@ -374,17 +375,8 @@ def test_blind_predictions_of_the_pilot_tests(pilot, scene):
 
 
 def test_predictions_look_at_nothing_that_was_measured_of_the_outcome(pilot):
-    nothing = np.full(13, math.nan)
-    bare = pilot[4]._replace(
-        centre=nothing,
-        edge=nothing,
-        total=nothing,
-        power=math.nan,
-        throughput=math.nan,
-        specific_throughput=math.nan,
-        specific_energy=math.nan,
-        gap=math.nan,
-    )
+    products, figures = ("centre", "edge", "total"), ("power", "throughput", "specific_throughput", "specific_energy")
+    bare = unmeasured(pilot[4], *products, *figures, "gap")
     for fit in (torres_casali(reference=0.04, blocks=3), hinde_kalala(HINDE, 0.045)):
         for one, two in zip(fit.predict(bare), fit.predict(pilot[4]), strict=True):
             assert one == pytest.approx(two, nan_ok=True)

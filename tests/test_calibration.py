@@ -2,6 +2,7 @@ import math
 
 import numpy as np
 import pytest
+from support import unmeasured
 
 import hpgr
 from hpgr import calibration, presets
@@ -119,16 +120,8 @@ def test_constants_of_machine_and_feed_are_each_groups_own_and_idle_power_is_tak
 @pytest.mark.plumbing
 def test_what_tests_do_not_tell_is_left_at_its_start_and_named(pilot_tests):
     """The total product alone: nothing of throughput, power and gap tells of K and alpha."""
-    bare = np.full(13, math.nan)
-    test = pilot_tests["K-P1"]._replace(
-        centre=bare,
-        edge=bare,
-        throughput=math.nan,
-        power=math.nan,
-        gap=math.nan,
-        cake_thickness=math.nan,
-        specific_energy=math.nan,
-    )
+    told = "centre", "edge", "throughput", "power", "gap", "cake_thickness", "specific_energy"
+    test = unmeasured(pilot_tests["K-P1"], *told)
     scene = start()
     found = fit_tests(scene, [test], ["gamma", "sigma_m", "alpha", "K"])
     assert "alpha" in found.undetermined

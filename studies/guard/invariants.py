@@ -172,7 +172,7 @@ def _sizes(scene: Scene, result: Result):
     if "size" in result:
         size = result["size"]
         yield size.min() >= np.float32(kernels.SMALLEST), f"a size is {size.min():g} m, below what is kept"
-        grows = result.attrs["solver"].startswith("march") and (np.diff(size, axis=2) > 0).any()
+        grows = _marched(result) and (np.diff(size, axis=2) > 0).any()
         yield not grows, "a grain grows along a streamline"
 
 
@@ -220,7 +220,7 @@ def _counts(scene: Scene, result: Result):
     floor, breaks = result["below_floor"], result["breaks_per_cell"]
     yield floor.min() >= 0 and floor.max() <= 1, f"below_floor leaves 0 to 1: {floor.min():g} to {floor.max():g}"
     yield breaks.min() >= 0, f"breaks_per_cell is {breaks.min():g}"
-    if result.attrs["solver"].startswith("march"):
+    if _marched(result):
         steps = (result["volumetric_strain_rate"] > 0).sum(axis=1)
         yield (breaks <= steps).all(), f"breaks_per_cell is {breaks.max():g}: more than one in a time step"
     if "exchange_substeps" in result:
@@ -239,7 +239,7 @@ def _unbroken(scene: Scene, result: Result):
     yield not result["breaks_per_cell"].any(), "grains broke under a stress below every strength"
     same = (result["passing"] >= least) & (result["passing"] <= most)
     yield same.all(), "the product's distribution is not the feed's, though nothing broke"
-    if "size" in result and result.attrs["solver"].startswith("march"):
+    if "size" in result and _marched(result):
         same = (result["size"] == _feed_cells(scene, result)[:, :, None]).all()
         yield same, "sizes are not those of the feed bit for bit, though nothing broke"
 
@@ -322,11 +322,15 @@ def _feed_passing(scene: Scene, result: Result) -> tuple[np.ndarray, np.ndarray]
         return tuple(np.broadcast_to(each.astype(np.float32), shape) for each in bounds)
     if _controlled(result) and _nothing_can_break(scene, result):  # what is known exactly is then the feed itself
         return (np.broadcast_to(scene.feed.passing(sieves).astype(np.float32), shape),) * 2
-    if _controlled(result) or not result.attrs["solver"].startswith("march"):
+    if _controlled(result) or not _marched(result):
         return np.zeros(shape), np.ones(shape)
     cells = _feed_cells(scene, result).transpose(1, 0, 2)
     counted = _counted(cells.reshape(len(cells), -1), scene)
     return counted, counted
+
+
+def _marched(result: Result) -> bool:
+    return result.attrs["solver"].startswith("march")
 
 
 def _controlled(result: Result) -> bool:
