@@ -91,7 +91,7 @@ def test_passing_rises_within_0_and_1(values, cushioning, cells, snapshots):
 def marched(values, complete):
     scene, bed = load(paper(BASE | values))
     log_stress = scene.strength.log_stress(solve.crushing_stress(scene, bed))
-    [found] = march.march(scene, log_stress, WHOLE, 0, [0], complete)
+    found = march.march(scene, log_stress, WHOLE, 0, [0], complete)
     return scene, log_stress, found
 
 
@@ -103,7 +103,7 @@ def test_cells_run_on_to_what_they_come_to_without_cushioning(values):
     assert np.any(found.complete < found.product)
     still = np.repeat(log_stress.max(axis=1, keepdims=True), 100, axis=1)
     free = scene.with_values({"strength.cushioning": "inf"})
-    [wanted] = march.march(free, np.hstack([log_stress, still]), WHOLE, 0, [0])
+    wanted = march.march(free, np.hstack([log_stress, still]), WHOLE, 0, [0])
     assert np.array_equal(found.complete, wanted.product)
 
 

@@ -374,8 +374,8 @@ def run(
         substeps=max(lattice.most_substeps, substeps),
         swaps_per_cell=2 * swaps / grid.streamlines,
     )
-    cells = Cells(np.stack(product), breaks, np.stack(sizes) if sizes else None, np.stack(classes) if classes else None)
-    return cells, exchanged
+    product, sizes, classes = (np.stack(part)[None] if part else None for part in (product, sizes, classes))
+    return Cells(product, breaks[None], sizes, classes), exchanged
 
 
 def _quantile_of(scene: Scene, shares: np.ndarray) -> Callable:

@@ -1,6 +1,5 @@
 """Without exchange: every parcel is marched once along its streamline, keyed by its own random numbers."""
 
-import itertools
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -26,13 +25,14 @@ class Cells(NamedTuple):
     Attributes
     ----------
     product : ndarray
-        (snapshot, line, cell) float32, sizes at the exit, m; a line is a streamline of a slice of the roll width.
+        (replicate, snapshot, line, cell) float32, sizes at the exit, m; a line is a streamline of a slice of the roll
+        width.
     breaks : ndarray
-        (line,) breaks of all cells of the product.
+        (replicate, line) breaks of all cells of the product.
     size : ndarray or None
-        (time, line, point, cell) float32, m.
+        (replicate, time, line, point, cell) float32, m.
     classes : ndarray or None
-        (time, line, point, sieve + 1) cells of each sieve class.
+        (replicate, time, line, point, sieve + 1) cells of each sieve class.
     complete : ndarray or None
         As `product`, sizes that the same cells come to without cushioning.
     """
@@ -99,8 +99,8 @@ def march(
     seed: int,
     replicates: Sequence[int],
     complete: bool = False,
-) -> Iterator[Cells]:
-    """March one parcel per slice, streamline and snapshot of each replicate; yield what every replicate leaves.
+) -> Cells:
+    """March one parcel per slice, streamline and snapshot of each replicate.
 
     Each parcel is keyed, so their order does not matter. Replicates share calls of the kernels: the Python between the
     calls costs as much as crushing a thousand cells.
@@ -123,36 +123,35 @@ def march(
     grid, tubes, points = scene.resolution, *log_stress.shape
     # every slice marches the same parcels under its own pressure, so that slices differ by that alone
     loads = path(scene, (log_stress + np.log(slices.pressure)[:, None, None]).reshape(-1, points))
-    columns = list(itertools.product(replicates, range(grid.snapshots), range(loads.log_stress.shape[0])))
-    keys = [(replicate, line % tubes, snapshot) for replicate, snapshot, line in columns]
-    lines, breaks = np.array([line for *_, line in columns]), np.empty(len(columns), np.int64)
-    product = np.empty((len(columns), grid.cells), np.float32)
+    shape = (len(replicates), grid.snapshots, loads.log_stress.shape[0])
+    keys = [(replicate, line % tubes, snapshot) for replicate in replicates for snapshot, line in np.ndindex(shape[1:])]
+    lines = np.tile(np.arange(shape[2]), shape[0] * shape[1])
+    product, breaks = np.empty((len(keys), grid.cells), np.float32), np.empty(len(keys), np.int64)
     ends = np.empty_like(product) if complete else None
-    record = Record()
+    record, laws = Record(), ore(scene)
     if grid.record == "cells":
-        record = Record(snapshots=np.empty((len(columns), points, grid.cells), np.float32))
+        record = Record(snapshots=np.empty((len(keys), points, grid.cells), np.float32))
     if grid.record == "distributions":
         sieves = cell_sieves(scene)
-        kept = np.empty((len(columns), points, sieves.size + 1), np.int64)
-        record = Record(sieves, np.empty((len(columns), sieves.size + 1), np.int64), kept)
+        kept = np.empty((len(keys), points, sieves.size + 1), np.int64)
+        record = Record(sieves, np.empty((len(keys), sieves.size + 1), np.int64), kept)
 
     def crush(part: slice) -> None:
         parcels = first_cells(scene, seed, keys[part])
         slots = np.arange(parcels.breaks.size)
         passage = Passage(slots, lines[part], 0 * slots, 0 * slots + points)
         own = Record(record.sieves, *(None if kept is None else kept[part] for kept in record[1:]))
-        kernels.crush(parcels, passage, loads, ore(scene), kernels.make_work(grid.cells), own)
+        kernels.crush(parcels, passage, loads, laws, kernels.make_work(grid.cells), own)
         product[part], breaks[part] = parcels.sizes[:, 1:-1], parcels.breaks
         if ends is not None:
-            critical, laws = loads.critical_ratio.min(axis=1)[lines[part]], ore(scene)
+            critical = loads.critical_ratio.min(axis=1)[lines[part]]
             kernels.complete(*parcels[:3], critical, laws.inverse_exponent, laws)
             ends[part] = parcels.sizes[:, 1:-1]
 
     step = max(AT_ONCE // grid.cells, 1)
     with cores(product.size) as each:
-        list(each(crush, [slice(k, k + step) for k in range(0, len(columns), step)]))
-    found = product, breaks, record.snapshots, record.classes, ends
-    shape = (len(replicates), grid.snapshots, -1)
-    parts = [[None] * len(replicates) if part is None else part.reshape(*shape, *part.shape[1:]) for part in found]
-    for cells, broken, *kept in zip(*parts, strict=True):
-        yield Cells(cells, broken.sum(axis=0), *kept)
+        list(each(crush, [slice(k, k + step) for k in range(0, len(keys), step)]))
+    breaks = breaks.reshape(shape).sum(axis=1)
+    parts = product, record.snapshots, record.classes, ends
+    product, *kept = (None if part is None else part.reshape(*shape, *part.shape[1:]) for part in parts)
+    return Cells(product, breaks, *kept)

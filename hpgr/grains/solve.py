@@ -128,13 +128,13 @@ def crush(scene: Scene, bed: LoadedBed, seed: int, replicates: Sequence[int]) ->
         return [_closed_form(scene, log_stress, slices)] * len(replicates)
     if solver.endswith("lattice"):
         found = [lattice.run(scene, log_stress, bed, seed, one, reduced=solver != "lattice") for one in replicates]
-        return [_summarised(scene, [cells], slices)[0]._replace(exchanged=exchanged) for cells, exchanged in found]
+        return [_summarised(scene, cells, slices)[0]._replace(exchanged=exchanged) for cells, exchanged in found]
     complete = _complete(scene, log_stress.max(axis=1)[None], slices)[0] if is_controlled(scene) else None
     grid, found = scene.resolution, []
     step = max(_TOGETHER // (slices.share.size * log_stress.shape[0] * grid.snapshots * grid.cells), 1)
     for k in range(0, len(replicates), step):
         cells = march.march(scene, log_stress, slices, seed, replicates[k : k + step], complete is not None)
-        found += _summarised(scene, list(cells), slices, complete)
+        found += _summarised(scene, cells, slices, complete)
     return found
 
 
@@ -195,11 +195,9 @@ def _zone(slices: Slices, at_edge: bool) -> np.ndarray:
     return share / share.sum()
 
 
-def _summarised(
-    scene: Scene, replicates: list[Cells], slices: Slices, exact: Callable | None = None
-) -> list[Crushed | None]:
+def _summarised(scene: Scene, cells: Cells, slices: Slices, exact: Callable | None = None) -> list[Crushed | None]:
     """Sum up the products, snapshots pooled; corrected by what complete crushing comes to, if that is known."""
-    pooled = _pooled([cells.product for cells in replicates], slices)
+    pooled = _pooled(cells.product, slices)
     whole = np.sort(pooled.reshape(*pooled.shape[:2], 1, -1), axis=-1)  # all lines as those of one
     zones = [_zone(slices, at_edge) for at_edge in (False, True)] if scene.roll_width else []
     shares = [slices.share, slices.share, *zones]
@@ -209,38 +207,40 @@ def _summarised(
     counts = _count(pooled, np.append(below_floor, march.cell_sieves(scene))[:, None])
     passing = counts / pooled.shape[-1]
     if exact is not None:
-        control = Control(_pooled([cells.complete for cells in replicates], slices), exact)
+        control = Control(_pooled(cells.complete, slices), exact)
         # not what is below the floor: a limit is hit by cells, not in the mean
         passing[..., 1:] = control.passing(counts[..., 1:], np.array(scene.resolution.sieves))
         for _ in range(2):  # the first read is off by the cells' own scatter, the second by little
             fractions = control.fractions(percentiles, shares)
             percentiles = [_quantiles(one, at) for one, at in zip(mixed, fractions, strict=True)]
+    combined = np.tensordot(slices.share, passing, axes=1)
+    breaks = slices.share @ (cells.breaks.reshape(len(cells.breaks), slices.share.size, -1) / pooled.shape[-1])
+    of_all, of_whole, *of_zones = percentiles
 
     def along_width(k: int) -> AlongWidth:
         each = passing[:, k, :, 1:].mean(axis=1)
-        return AlongWidth(each, *(zone @ each for zone in zones), *(part[:, k, 0] for part in percentiles[2:]))
+        return AlongWidth(each, *(zone @ each for zone in zones), *(part[:, k, 0] for part in of_zones))
 
-    def summed(k: int, cells: Cells) -> Crushed:
-        combined = np.tensordot(slices.share, passing[:, k], axes=1)
-        return Crushed(
-            breaks=slices.share @ (cells.breaks.reshape(slices.share.size, -1) / pooled.shape[-1]),
-            below_floor=combined[:, 0],
-            passing=combined[:, 1:],
-            percentiles=percentiles[0][:, k],
-            total_percentiles=percentiles[1][:, k, 0],
-            size=cells.size,
-            mass_fraction=None if cells.classes is None else cells.classes[..., :-1] / scene.resolution.cells,
+    return [
+        Crushed(
+            breaks=breaks[k],
+            below_floor=combined[k, :, 0],
+            passing=combined[k, :, 1:],
+            percentiles=of_all[:, k],
+            total_percentiles=of_whole[:, k, 0],
+            size=None if cells.size is None else cells.size[k],
+            mass_fraction=None if cells.classes is None else cells.classes[k, ..., :-1] / scene.resolution.cells,
             along_width=along_width(k) if zones else None,
         )
+        for k in range(len(breaks))
+    ]
 
-    return [summed(k, cells) for k, cells in enumerate(replicates)]
 
-
-def _pooled(products: list[np.ndarray], slices: Slices) -> np.ndarray:
-    """Return the cells (slice, replicate, streamline, cell) of products (snapshot, line, cell), sorted."""
-    by_line = np.stack(products).transpose(2, 0, 1, 3)
-    by_line = by_line.reshape(slices.share.size, -1, *by_line.shape[1:]).transpose(0, 2, 1, 3, 4)
-    pooled = by_line.reshape(*by_line.shape[:3], -1)
+def _pooled(product: np.ndarray, slices: Slices) -> np.ndarray:
+    """Return cells (replicate, snapshot, line, cell) as (slice, replicate, streamline, cell), sorted."""
+    replicates, snapshots, _, cells = product.shape
+    by_slice = product.reshape(replicates, snapshots, slices.share.size, -1, cells).transpose(2, 0, 3, 1, 4)
+    pooled = by_slice.reshape(*by_slice.shape[:3], -1)
     pooled.sort(axis=-1)
     return pooled
 
