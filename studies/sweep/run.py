@@ -93,23 +93,30 @@ def run_point(runner: Runner, cases: list[Case]) -> list[CaseResult]:
         told = faults_of(error) if isinstance(error, ValidationError) else str(error)
         words = told if refused else f"{type(error).__name__}: {told}"
         return [CaseResult(cases[0].index, "refused" if refused else "failed", words, {})]
-    return [_told(runner.spec, case, result) for case, result in zip(cases, results, strict=True)]
+    return list(_told(runner.spec, cases, results))
 
 
-def _told(spec: SweepSpec, case: Case, result: Result) -> CaseResult:
-    """Return what is told of a case that came to a result."""
+def _told(spec: SweepSpec, cases: list[Case], results: list[Result]) -> Iterator[CaseResult]:
+    """Yield what is told of cases of an operating point that came to results."""
     wanted = _KNOWN if spec.whole else _SUMMARY
-    values = {name: result.values[name] for name in wanted if result.values.get(name) is not None}
-    whole = {name: np.asarray(value, wanted[name].dtype) for name, value in values.items()}
-    summary = {name: value for name, value in whole.items() if name in _SUMMARY}
-    if not np.isfinite(np.concatenate([value.ravel() for value in summary.values()])).all():  # one by one: 0.1 ms
-        broken = [name for name, value in summary.items() if not np.isfinite(value).all()]
-        return CaseResult(case.index, "failed", f"not finite: {', '.join(broken)}", {})
-    if not spec.whole:
-        return CaseResult(case.index, "ok", "", summary, result.diagnostics)
     title = "Comminution in high pressure grinding rolls, heterarchical model: one case of a study"
-    attrs = attributes(result, title, spec.seed, case.replicate)
-    return CaseResult(case.index, "ok", "", summary, result.diagnostics, whole, attrs)
+    values: dict[str, Any] = {}
+    stored: dict[str, np.ndarray] = {}
+    for case, result in zip(cases, results, strict=True):
+        before, values = values, {name: result.values[name] for name in wanted if result.values.get(name) is not None}
+        stored = {  # what replicates share, which is most, once
+            name: stored[name] if before.get(name) is value else np.asarray(value, wanted[name].dtype)
+            for name, value in values.items()
+        }
+        summary = {name: value for name, value in stored.items() if name in _SUMMARY} if spec.whole else stored
+        if not np.isfinite(np.concatenate([value.ravel() for value in summary.values()])).all():  # one by one: 0.1 ms
+            broken = [name for name, value in summary.items() if not np.isfinite(value).all()]
+            yield CaseResult(case.index, "failed", f"not finite: {', '.join(broken)}", {})
+        elif not spec.whole:
+            yield CaseResult(case.index, "ok", "", summary, result.diagnostics)
+        else:
+            attrs = attributes(result, title, spec.seed, case.replicate)
+            yield CaseResult(case.index, "ok", "", summary, result.diagnostics, stored, attrs)
 
 
 def run_batch(spec: SweepSpec, cases: list[Case]) -> list[CaseResult]:
