@@ -71,7 +71,6 @@ class Parcels(NamedTuple):
     streams: np.ndarray  # uint64 (slot, cell + 2), state of the random stream of each place
     weakness: np.ndarray | None  # float32 (slot, cell + 2), by which a grain's own strength multiplies its effective
     # size; None where strengths do not scatter
-    unshielded: np.ndarray  # float32 (slot, cell + 2), bounds of cells that nothing is known of but themselves
     bounds: np.ndarray  # float32 (slot, block x BLOCK + 2), upper bounds of effective size over s_m
     block_bounds: np.ndarray  # float32 (slot, block, to the next BLOCK), the largest in each block
     bounds_outdated: np.ndarray  # bool (slot,), whether bounds are to be set anew before they are used
@@ -136,7 +135,6 @@ def make_parcels(count: int, cells: int, scattered: bool) -> Parcels:
         np.zeros((count, cells + 2), np.float32),
         np.zeros((count, cells + 2), np.uint64),
         np.empty((count, cells + 2), np.float32) if scattered else None,
-        np.empty((count, cells + 2), np.float32),
         np.empty((count, blocks * BLOCK + 2), np.float32),
         np.empty((count, -(-blocks // BLOCK) * BLOCK), np.float32),
         np.ones(count, bool),
@@ -438,26 +436,33 @@ def _raise(exponent, count, values, bits, exponents, powers, power_bits):
 
 
 @_inlined
-def _unshielded(size, ore):
+def _least_known(ore):
+    """Return what `_unshielded` takes of the ore, in float32: what of it is rounded, the margin covers."""
+    sized = ore.inverse_size > 0.0  # without size effect every size may break
+    return (
+        np.float32(ore.inverse_size * _MARGIN),
+        np.float32(0.0 if sized else _MARGIN),
+        np.float32(ore.size_floor),
+    )
+
+
+@_inlined
+def _unshielded(sizes, weakness, slot, p, known):
     """Return the bound of a cell whose neighbourhood is new; nothing below the floor ever breaks."""
-    # without size effect every size may break
-    bound = np.float32(size * (ore.inverse_size * _MARGIN)) if ore.inverse_size > 0.0 else np.float32(_MARGIN)
-    return _NEVER if size < ore.size_floor else bound
+    per_size, flat, floor = known
+    bound = sizes[p] * per_size + flat
+    if weakness is not None:
+        bound *= weakness[slot, p]
+    return bound if sizes[p] >= floor else _NEVER
 
 
 @_inner
-def _set_bounds(sizes, weakness, slot, unshielded, bounds, block_bounds, ore):
+def _set_bounds(sizes, weakness, slot, bounds, block_bounds, known):
     """Set the bounds of a line of cells whose neighbourhoods are all new."""
     cells = sizes.size - 2
     sizes[0], sizes[cells + 1] = sizes[cells], sizes[1]
-    unshielded[0] = unshielded[cells + 1] = _NEVER
-    for p in range(1, cells + 1):
-        unshielded[p] = _unshielded(np.float64(sizes[p]), ore)
-    if weakness is not None:
-        for p in range(1, cells + 1):
-            unshielded[p] *= weakness[slot, p]
     for p in range(bounds.size):
-        bounds[p] = unshielded[p] if p <= cells else _NEVER
+        bounds[p] = _unshielded(sizes, weakness, slot, p, known) if 1 <= p <= cells else _NEVER
     for block in range(block_bounds.size):
         block_bounds[block] = _largest(bounds, block * BLOCK + 1) if block * BLOCK < cells else _NEVER
 
@@ -596,24 +601,30 @@ def _settle_powers(exponent, sizes, streams, places, found, ratios, exponents):
 
 
 @_inlined
-def _break(sizes, unshielded, places, found, ore, ratios):
-    """Replace each cell that breaks by its fragment."""
+def _break(sizes, weakness, slot, bounds, places, found, known, ratios):
+    """Replace each cell that breaks by its fragment; set anew its bound and its neighbours', around the ends too."""
+    cells = sizes.size - 2
     for k in range(found):
         p, ratio = places[k], ratios[k]
-        size = np.float32(sizes[p] * ratio if sizes[p] * ratio > SMALLEST else SMALLEST)
-        sizes[p] = size
-        unshielded[p] = _unshielded(np.float64(size), ore)
-    sizes[0], sizes[sizes.size - 1] = sizes[sizes.size - 2], sizes[1]
+        sizes[p] = np.float32(sizes[p] * ratio if sizes[p] * ratio > SMALLEST else SMALLEST)
+        bounds[p - _1] = _unshielded(sizes, weakness, slot, p - _1, known)
+        bounds[p] = _unshielded(sizes, weakness, slot, p, known)
+        bounds[p + _1] = _unshielded(sizes, weakness, slot, p + _1, known)
+    sizes[0], sizes[cells + 1] = sizes[cells], sizes[1]
+    bounds[0] = bounds[cells + 1] = _NEVER
+    if found and places[0] == 1:
+        bounds[cells] = _unshielded(sizes, weakness, slot, cells, known)
+    if found and places[found - 1] == cells:
+        bounds[1] = _unshielded(sizes, weakness, slot, 1, known)
 
 
 @_inner
-def _draw_strength(streams, weakness, slot, unshielded, places, found, ore):
+def _draw_strength(streams, weakness, slot, places, found, ore):
     """Draw the strength of each fragment."""
     if weakness is not None:
         for k in range(found):
             p = places[k]
             weakness[slot, p] = _weakness(streams[p], ore)
-            unshielded[p] *= weakness[slot, p]
 
 
 @_inner
@@ -625,19 +636,6 @@ def _keep(sizes, counts, k, j, snapshots, classes):
     if classes is not None:
         for m in range(classes.shape[2]):
             classes[k, j, m] = counts[k, m]
-
-
-@_inlined
-def _renew(unshielded, bounds, places, found):
-    """Set anew the bounds of the cells that broke and of their neighbours, around the ends of the line too."""
-    cells = unshielded.size - 2
-    for k in range(found):
-        p = places[k]
-        bounds[p - _1], bounds[p], bounds[p + _1] = unshielded[p - _1], unshielded[p], unshielded[p + _1]
-    if found and places[0] == 1:
-        bounds[cells] = unshielded[cells]
-    if found and places[found - 1] == cells:
-        bounds[1] = unshielded[1]
 
 
 @_inlined
@@ -665,29 +663,29 @@ def crush(parcels, passage, path, ore, work, record):
     active, places, chosen, bits, totals, ratios, ratio_bits, states, tight, breaking, unsure = work
     log_stress, critical_ratio = path
     sieves, counts = record.sieves, record.counts
-    cells, cushion = parcels.sizes.shape[1] - 2, ore.cushion / ore.scale
+    cells, cushion, known = parcels.sizes.shape[1] - 2, ore.cushion / ore.scale, _least_known(ore)
     for k in range(passage.slots.size):
         slot, line = passage.slots[k], passage.lines[k]
         sizes, streams = parcels.sizes[slot], parcels.streams[slot]
-        unshielded, bounds, block_bounds = parcels.unshielded[slot], parcels.bounds[slot], parcels.block_bounds[slot]
+        weakness, bounds, block_bounds = parcels.weakness, parcels.bounds[slot], parcels.block_bounds[slot]
         classify(parcels.sizes, slot, sieves, k, counts)
         for j in range(passage.first[k], passage.last[k]):
             critical = critical_ratio[line, j]
             if critical < np.inf:
                 if parcels.bounds_outdated[slot]:
-                    _set_bounds(sizes, parcels.weakness, slot, unshielded, bounds, block_bounds, ore)
+                    _set_bounds(sizes, weakness, slot, bounds, block_bounds, known)
                     parcels.bounds_outdated[slot] = False
                 needed = np.float32(critical if critical < 3e38 else 3e38)  # beyond every effective size of float32
                 actives = _list_blocks(needed, block_bounds, active)
                 count = _list_candidates(needed, bounds, active, actives, places)
-                _gather(sizes, parcels.weakness, slot, places, count, ore, chosen, totals, ratios)
+                _gather(sizes, weakness, slot, places, count, ore, chosen, totals, ratios)
                 if ore.strength == SIZE_EFFECT:
                     # in whole vectors; what is decided beyond the last candidate is not read
                     whole = (count + BLOCK - 1) // BLOCK * BLOCK
                     if _decide(whole, chosen, totals, ratios, cushion, critical, tight, breaking, unsure):
-                        level, weak = log_stress[line, j], parcels.weakness
+                        level = log_stress[line, j]
                         _decide_by_logarithms(
-                            count, chosen, totals, weak, slot, places, ore, level, tight, breaking, unsure
+                            count, chosen, totals, weakness, slot, places, ore, level, tight, breaking, unsure
                         )
                 found = _list_breaks(count, tight, breaking, bounds, places)
                 _count(sizes, places, found, sieves, k, -1, counts)
@@ -697,10 +695,9 @@ def crush(parcels, passage, path, ore, work, record):
                     _exponents(exponent, sizes, places, found, whole, ore, totals)
                     _raise(exponent, whole, chosen, bits, totals, ratios, ratio_bits)
                     _settle_powers(exponent, sizes, streams, places, found, chosen, totals)
-                _break(sizes, unshielded, places, found, ore, chosen)
-                _draw_strength(streams, parcels.weakness, slot, unshielded, places, found, ore)
+                _draw_strength(streams, weakness, slot, places, found, ore)
+                _break(sizes, weakness, slot, bounds, places, found, known, chosen)
                 _count(sizes, places, found, sieves, k, 1, counts)
-                _renew(unshielded, bounds, places, found)
                 _renew_blocks(bounds, block_bounds, active, actives, cells)
                 parcels.breaks[slot] += found
             _keep(sizes, counts, k, j, record.snapshots, record.classes)
