@@ -107,6 +107,30 @@ def test_march_is_the_plain_reference_on_any_line(sizes, history, n, w, gamma, f
     assert same(sizes, streams(sizes.size, 5), history, n=n, w=w, gamma=gamma, floor=floor)
 
 
+@pytest.mark.parametrize("n", [1e-6, 1e-3, 0.1, 1.0, 30.0, INF])
+@pytest.mark.parametrize("k", [2.0, INF])
+def test_stresses_next_to_a_cells_strength_are_decided_as_by_the_plain_reference(n, k):
+    """Where float32 would round to the other side: stresses that cells just bear, or not, of like and unlike sizes."""
+    for like, seed in ((1e-6, 1), (1e-3, 2), (1.0, 3)):
+        sizes, states = line(48, seed, 0.02, 0.02 * (1 + like))
+        law = laws(n=n, k=k).strength
+        strengths = law.log_strength(sizes) - 3 / law.weibull_modulus * np.log(weakness(law, states).astype(float))
+        level = float(np.sort(strengths)[24])
+        for off in 10.0 ** np.arange(-11, -4):  # less is the rounding of float64
+            for side in (off, -off):
+                assert same(sizes, states, [level + side * max(1.0, abs(level))], n=n, k=k)
+
+
+def test_grains_that_are_below_the_floor_by_rounding_do_not_break():
+    """float32(0.7) is less than 0.7, and so is what is stored of a grain of 0.7 m; the next larger is not."""
+    below = np.float32(0.7)
+    sizes = np.array([below, np.nextafter(below, np.float32(1))] * 8)
+    assert below.item() < 0.7 < sizes[1].item()
+    _, _, breaks = march(sizes, streams(16), [50.0], n=INF, floor=0.7)
+    assert breaks == 8
+    assert same(sizes, streams(16), [50.0], n=INF, floor=0.7)
+
+
 def test_reference_is_not_idle():
     """The comparisons above are of lines that do break, and not everywhere."""
     sizes, states = line(100, seed=3)

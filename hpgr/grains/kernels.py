@@ -501,10 +501,10 @@ def _decide(count, before, own, after, weakness, weak, ore, critical_ratio, verd
     """Decide breaks by rational bounds of the size-effect law; return whether any is unsure.
 
     Verdicts are 1 of a cell that breaks and 2 of one that is unsure; its tight bound takes the place of the neighbour
-    before. (Two arrays less are a tenth less of a march of 1,600 points: loops test arrays for overlap before they run.)
+    before: loops test their arrays for overlap before they run, and two arrays more cost a march of 1,600 points 15 %.
 
-    In float32, whose vectors are twice as long and divide four times as fast (march x 0.85): every bound has room for
-    its rounding, and what that leaves open goes to the logarithms.
+    In float32, whose vectors are twice as long and divide four times as fast. Every bound has room for its rounding:
+    3e-7 in z, less than 1e-6 in the cubics, 2e-6 in what they are compared with. Logarithms decide what that leaves.
     """
     zero, half, one, two, three = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0), np.float32(3.0)
     third, fifth, sixth = np.float32(1 / 3), np.float32(1 / 5), np.float32(1 / 6)
@@ -556,7 +556,7 @@ def _decide_by_logarithms(count, sizes, weakness, slot, places, ore, log_stress,
             unlike = math.log(size / mean)
             strength = ore.cushion * unlike * unlike - ore.slope * math.log(size / ore.reference_size)
             if weakness is not None:
-                strength -= ore.scale * math.log(weakness[slot, p])
+                strength -= ore.scale * math.log(np.float64(weakness[slot, p]))
             verdicts[k] = log_stress >= strength
             bounds[k] = np.float32(math.exp(-strength / ore.scale) * _MARGIN)
 

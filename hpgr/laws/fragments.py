@@ -17,7 +17,7 @@ class FragmentConstants(NamedTuple):
     inverse_exponent: float | None  # 1 / gamma; None where fragments are uniform
     size_exponent: float  # nu
     parent_size: float  # s_r, m
-    size_floor: float  # m
+    size_floor: float  # m; up to the next float32, as which sizes are compared with it
 
 
 class PowerLawFragments(Frozen):
@@ -64,7 +64,9 @@ class PowerLawFragments(Frozen):
     def constants(self) -> FragmentConstants:
         """Return the law as the kernels take it."""
         inverse = None if self.exponent == 1 and self.size_exponent == 0 else 1 / self.exponent
-        return FragmentConstants(POWER_LAW, inverse, self.size_exponent, self.reference_size, self.size_floor)
+        floor = np.float32(self.size_floor)
+        floor = floor if float(floor) >= self.size_floor else np.nextafter(floor, np.float32(np.inf))
+        return FragmentConstants(POWER_LAW, inverse, self.size_exponent, self.reference_size, float(floor))
 
 
 Fragments = PowerLawFragments
