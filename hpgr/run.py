@@ -210,7 +210,7 @@ def _product(scene: Scene, crushed: solve.Crushed | None) -> dict[str, Any]:
         "size": crushed.size,
         "mass_fraction": crushed.mass_fraction,
         "passing": crushed.passing,
-        "passing_total": crushed.passing.mean(axis=0),
+        "passing_total": crushed.total_passing,
         "p50": crushed.percentiles[0],
         "p80": crushed.percentiles[1],
         "p50_total": crushed.total_percentiles[0],

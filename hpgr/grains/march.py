@@ -1,5 +1,6 @@
 """Without exchange: every parcel is marched once along its streamline, keyed by its own random numbers."""
 
+import itertools
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -124,7 +125,8 @@ def march(
     # every slice marches the same parcels under its own pressure, so that slices differ by that alone
     loads = path(scene, (log_stress + np.log(slices.pressure)[:, None, None]).reshape(-1, points))
     shape = (len(replicates), grid.snapshots, loads.log_stress.shape[0])
-    keys = [(replicate, line % tubes, snapshot) for replicate in replicates for snapshot, line in np.ndindex(shape[1:])]
+    columns = itertools.product(replicates, range(shape[1]), range(shape[2]))
+    keys = [(replicate, line % tubes, snapshot) for replicate, snapshot, line in columns]
     lines = np.tile(np.arange(shape[2]), shape[0] * shape[1])
     product, breaks = np.empty((len(keys), grid.cells), np.float32), np.empty(len(keys), np.int64)
     ends = np.empty_like(product) if complete else None

@@ -49,8 +49,8 @@ class Crushed(NamedTuple):
         (streamline,) mean number of breaks per cell.
     below_floor : ndarray
         (streamline,) fraction of the product below the size floor, where nothing breaks.
-    passing : ndarray
-        (streamline, sieve) mass fraction of the product passing each sieve.
+    passing, total_passing : ndarray
+        (streamline, sieve) and (sieve,), mass fraction of the product passing each sieve.
     percentiles, total_percentiles : ndarray
         (2, streamline) and (2,), P50 and P80 of the product, m.
     size : ndarray
@@ -66,6 +66,7 @@ class Crushed(NamedTuple):
     breaks: np.ndarray
     below_floor: np.ndarray
     passing: np.ndarray
+    total_passing: np.ndarray
     percentiles: np.ndarray
     total_percentiles: np.ndarray
     size: np.ndarray | None = None
@@ -164,10 +165,12 @@ def _closed_form(scene: Scene, log_stress: np.ndarray, slices: Slices) -> Crushe
         parts = np.array_split(highest, -(-highest.size // _AT_ONCE), axis=1)
         points = [_complete(scene, part, WHOLE)[0](size=sieves[:, None, None, None])[:, 0] for part in parts]
         mass = np.diff(np.moveaxis(np.concatenate(points, axis=-1), 0, -1), axis=-1, prepend=0.0)[None]
+    of_tubes = passing(np.tile(sieves[:, None], tubes)).T
     return Crushed(
         breaks=slices.share @ breaks(),
         below_floor=passing(np.full(tubes, np.nextafter(scene.fragments.size_floor, 0.0))),
-        passing=passing(np.tile(sieves[:, None], tubes)).T,
+        passing=of_tubes,
+        total_passing=of_tubes.mean(axis=0),
         percentiles=closed_form.percentile(passing, np.tile(fractions, tubes), feed.largest_grain),
         total_percentiles=closed_form.percentile(total_passing, fractions, feed.largest_grain)[:, 0],
         mass_fraction=mass,
@@ -215,6 +218,7 @@ def _summarised(scene: Scene, cells: Cells, slices: Slices, exact: Callable | No
             percentiles = [_quantiles(one, at) for one, at in zip(mixed, fractions, strict=True)]
     combined = np.tensordot(slices.share, passing, axes=1)
     breaks = slices.share @ (cells.breaks.reshape(len(cells.breaks), slices.share.size, -1) / pooled.shape[-1])
+    total_passing = combined[..., 1:].mean(axis=1)
     of_all, of_whole, *of_zones = percentiles
 
     def along_width(k: int) -> AlongWidth:
@@ -226,6 +230,7 @@ def _summarised(scene: Scene, cells: Cells, slices: Slices, exact: Callable | No
             breaks=breaks[k],
             below_floor=combined[k, :, 0],
             passing=combined[k, :, 1:],
+            total_passing=total_passing[k],
             percentiles=of_all[:, k],
             total_percentiles=of_whole[:, k, 0],
             size=None if cells.size is None else cells.size[k],

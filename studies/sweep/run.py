@@ -98,16 +98,18 @@ def run_point(runner: Runner, cases: list[Case]) -> list[CaseResult]:
 
 def _told(spec: SweepSpec, cases: list[Case], results: list[Result]) -> Iterator[CaseResult]:
     """Yield what is told of cases of an operating point that came to results."""
-    wanted = _KNOWN if spec.whole else _SUMMARY
+    known = _KNOWN if spec.whole else _SUMMARY
+    types = {name: known[name].dtype for name in known if results[0].values.get(name) is not None}
     title = "Comminution in high pressure grinding rolls, heterarchical model: one case of a study"
-    values: dict[str, Any] = {}
     stored: dict[str, np.ndarray] = {}
+    before = results[0].values
     for case, result in zip(cases, results, strict=True):
-        before, values = values, {name: result.values[name] for name in wanted if result.values.get(name) is not None}
+        values = result.values
         stored = {  # what replicates share, which is most, once
-            name: stored[name] if before.get(name) is value else np.asarray(value, wanted[name].dtype)
-            for name, value in values.items()
+            name: stored[name] if stored and values[name] is before[name] else np.asarray(values[name], dtype)
+            for name, dtype in types.items()
         }
+        before = values
         summary = {name: value for name, value in stored.items() if name in _SUMMARY} if spec.whole else stored
         if not np.isfinite(np.concatenate([value.ravel() for value in summary.values()])).all():  # one by one: 0.1 ms
             broken = [name for name, value in summary.items() if not np.isfinite(value).all()]
