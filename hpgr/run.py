@@ -3,7 +3,7 @@
 Not simulate.py: importing a module of that name would replace the function `hpgr.simulate` by the module.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -68,17 +68,26 @@ def run_scene(scene: Scene, seed: int = 0, replicate: int = 0, beds: Beds | None
     >>> round(result.scene.rolls.gap, 4), round(float(result.values["specific_pressing_force"]))
     (0.059, 4000000)
     """
-    [result] = run_replicates(scene, seed, [replicate], beds)
+    [[result]] = run_together([(scene, [replicate])], seed, beds)
     return result
 
 
-def run_replicates(scene: Scene, seed: int, replicates: Sequence[int], beds: Beds | None = None) -> list[Result]:
-    """Run `scene` once for every replicate; its bed, and what is known of it, they share."""
-    scene, bed = load(scene, beds)
+def run_together(
+    points: Iterable[tuple[Scene, Sequence[int]]], seed: int, beds: Beds | None = None
+) -> list[list[Result]]:
+    """Run each scene once for every one of its replicates.
+
+    Replicates share their bed and what is known of it; scenes that differ by feed and load alone share calls of the
+    kernels. All beds are held at once.
+    """
+    loaded = [solve.Loaded(*load(scene, beds), replicates) for scene, replicates in points]
+    return [_results(*one[:2], products) for one, products in zip(loaded, solve.crush(loaded, seed), strict=True)]
+
+
+def _results(scene: Scene, bed: LoadedBed, products: list[solve.Crushed | None]) -> list[Result]:
     throughput = metrics.gap_throughput(scene, float(bed.stress.solid_fraction[:, -1].mean()))
     performance = machine.performance(scene, bed.pressed, throughput)
     of_bed = _fields(bed) | _summaries(scene, bed) | performance._asdict() | {"throughput": throughput}
-    products = solve.crush(scene, bed, seed, replicates)
     limits = flags.diagnose(scene, bed, performance, products)
     solver = solve.choose(scene) + ", control variate" * solve.is_controlled(scene)
     return [

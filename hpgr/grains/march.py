@@ -6,13 +6,14 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
 
 from hpgr.grains import kernels
 from hpgr.grains.kernels import Ore, Parcels, Passage, Path, Record
+from hpgr.laws.feed import Feed
 from hpgr.laws.roll_width import Slices
 from hpgr.scene import Scene
 
@@ -82,6 +83,14 @@ def first_cells(scene: Scene, seed: int, keys: list[tuple[int, ...]], quantile: 
     return parcels
 
 
+def _quantiles(feeds: list[tuple[Feed, int]], uniforms: np.ndarray) -> np.ndarray:
+    """Return the sizes that uniforms (parcel, cell) stand for, given each feed and the number of its parcels."""
+    ends = itertools.accumulate(count for _, count in feeds)
+    return np.concatenate(
+        [feed.quantile(uniforms[end - count : end]) for (feed, count), end in zip(feeds, ends, strict=True)]
+    )
+
+
 @contextmanager
 def cores(cells: int) -> Iterator[Callable]:
     """Give a map over parts of the work: on all cores where there are many cells, and nobody else has the cores."""
@@ -94,40 +103,41 @@ def cores(cells: int) -> Iterator[Callable]:
 
 
 def march(
-    scene: Scene,
+    scenes: Sequence[Scene],
     log_stress: np.ndarray,
     slices: Slices,
     seed: int,
-    replicates: Sequence[int],
+    runs: Sequence[tuple[int, int]],
     complete: bool = False,
 ) -> Cells:
-    """March one parcel per slice, streamline and snapshot of each replicate.
+    """March one parcel per slice, streamline and snapshot of each run.
 
-    Each parcel is keyed, so their order does not matter. Replicates share calls of the kernels: the Python between the
+    Each parcel is keyed, so their order does not matter. Runs share calls of the kernels: the Python between the
     calls costs as much as crushing a thousand cells.
 
     Parameters
     ----------
-    scene : Scene
-        What is simulated.
+    scenes : sequence of Scene
+        What is simulated; scenes may differ in their feed and what loads it.
     log_stress : ndarray
-        (streamline, point) log(sigma_a / sigma_m) in the middle of the roll width.
+        (scene, streamline, point) log(sigma_a / sigma_m) in the middle of the roll width.
     slices : Slices
         The slices along the roll width.
     seed : int
         Key of the randomness, with the replicates.
-    replicates : sequence of int
-        Independent repetitions.
+    runs : sequence of (int, int)
+        Number of the scene, those of one together, and of the independent repetition.
     complete : bool
         Whether to tell what the cells come to without cushioning, too.
     """
-    grid, tubes, points = scene.resolution, *log_stress.shape
+    scene, grid = scenes[0], scenes[0].resolution
+    _, tubes, points = log_stress.shape
     # every slice marches the same parcels under its own pressure, so that slices differ by that alone
-    loads = path(scene, (log_stress + np.log(slices.pressure)[:, None, None]).reshape(-1, points))
-    shape = (len(replicates), grid.snapshots, loads.log_stress.shape[0])
-    columns = itertools.product(replicates, range(shape[1]), range(shape[2]))
-    keys = [(replicate, line % tubes, snapshot) for replicate, snapshot, line in columns]
-    lines = np.tile(np.arange(shape[2]), shape[0] * shape[1])
+    loads = path(scene, (log_stress[:, None] + np.log(slices.pressure)[:, None, None]).reshape(-1, points))
+    shape = (len(runs), grid.snapshots, loads.log_stress.shape[0] // len(scenes))
+    columns = list(itertools.product(runs, range(shape[1]), range(shape[2])))
+    keys = [(replicate, line % tubes, snapshot) for (_, replicate), snapshot, line in columns]
+    lines = np.array([number * shape[2] + line for (number, _), _, line in columns])
     product, breaks = np.empty((len(keys), grid.cells), np.float32), np.empty(len(keys), np.int64)
     ends = np.empty_like(product) if complete else None
     record, laws = Record(), ore(scene)
@@ -139,7 +149,11 @@ def march(
         record = Record(sieves, np.empty((len(keys), sieves.size + 1), np.int64), kept)
 
     def crush(part: slice) -> None:
-        parcels = first_cells(scene, seed, keys[part])
+        feeds = [
+            (scenes[number].feed, len(list(same)))
+            for number, same in itertools.groupby(columns[part], lambda one: one[0][0])
+        ]
+        parcels = first_cells(scene, seed, keys[part], partial(_quantiles, feeds))
         slots = np.arange(parcels.breaks.size)
         passage = Passage(slots, lines[part], 0 * slots, 0 * slots + points)
         own = Record(record.sieves, *(None if kept is None else kept[part] for kept in record[1:]))

@@ -1,7 +1,9 @@
 """Picks the cheapest solver the scene allows, runs it, and sums up the product (docs/model.md, Solvers)."""
 
+import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -106,37 +108,79 @@ def crushing_stress(scene: Scene, bed: LoadedBed) -> np.ndarray:
     return np.where(bed.kinematics.volumetric_rate > 0, stress, 0.0)
 
 
-def crush(scene: Scene, bed: LoadedBed, seed: int, replicates: Sequence[int]) -> list[Crushed | None]:
-    """Crush the feed of `scene` in its loaded bed, once for every replicate; None for a stress-only scene.
+class Loaded(NamedTuple):
+    """A scene, its bed, tessellated if the lattice is the solver, and the independent repetitions to run."""
 
-    Parameters
-    ----------
-    scene : Scene
-        What is simulated.
-    bed : LoadedBed
-        Its bed, tessellated if the lattice is the solver.
-    seed : int
-        Key of the randomness, with the replicates.
-    replicates : sequence of int
-        Independent repetitions, which share what is known without random numbers.
+    scene: Scene
+    bed: LoadedBed
+    replicates: Sequence[int]
+
+
+def crush(points: Iterable[Loaded], seed: int) -> list[list[Crushed | None]]:
+    """Crush the feed of each scene in its bed, once for every replicate; None for a stress-only scene.
+
+    Neighbours that differ by feed and load alone share calls of the kernels, and replicates what is known without
+    random numbers. `seed` is the key of the randomness, with the replicates.
     """
+    found: list[list[Crushed | None]] = []
+    for together, group in itertools.groupby(points, lambda one: _marched_with(one.scene)):
+        alike = list(group)
+        found += _crush_together(alike, seed) if together else [_crush_alone(one, seed) for one in alike]
+    return found
+
+
+def _marched_with(scene: Scene) -> tuple | None:
+    """Return what scenes must have in common to be marched in the same calls; None for those that are not."""
+    if choose(scene) != "march":
+        return None
+    slices = scene.roll_width and (scene.roll_width, scene.rolls.width, scene.rolls.gap)
+    return march.ore(scene), scene.resolution, is_controlled(scene), slices
+
+
+def _slices(scene: Scene) -> Slices:
+    return WHOLE if scene.roll_width is None else scene.roll_width.cut(scene.rolls.gap, scene.rolls.width)
+
+
+def _crush_alone(point: Loaded, seed: int) -> list[Crushed | None]:
+    scene, bed, replicates = point
     solver = choose(scene)
     if solver == "stress only":
         return [None] * len(replicates)
-    log_stress = scene.strength.log_stress(crushing_stress(scene, bed))
-    slices = WHOLE if scene.roll_width is None else scene.roll_width.cut(scene.rolls.gap, scene.rolls.width)
+    log_stress, slices = scene.strength.log_stress(crushing_stress(scene, bed)), _slices(scene)
     if solver == "closed form":
         return [_closed_form(scene, log_stress, slices)] * len(replicates)
-    if solver.endswith("lattice"):
-        found = [lattice.run(scene, log_stress, bed, seed, one, reduced=solver != "lattice") for one in replicates]
-        return [_summarised(scene, cells, slices)[0]._replace(exchanged=exchanged) for cells, exchanged in found]
-    complete = _complete(scene, log_stress.max(axis=1)[None], slices)[0] if is_controlled(scene) else None
-    grid, found = scene.resolution, []
-    step = max(_TOGETHER // (slices.share.size * log_stress.shape[0] * grid.snapshots * grid.cells), 1)
-    for k in range(0, len(replicates), step):
-        cells = march.march(scene, log_stress, slices, seed, replicates[k : k + step], complete is not None)
-        found += _summarised(scene, cells, slices, complete)
-    return found
+    found = [lattice.run(scene, log_stress, bed, seed, one, reduced=solver != "lattice") for one in replicates]
+    return [_summarised(scene, cells, slices)[0]._replace(exchanged=exchanged) for cells, exchanged in found]
+
+
+def _crush_together(points: list[Loaded], seed: int) -> list[list[Crushed]]:
+    scenes, slices = [one.scene for one in points], _slices(points[0].scene)
+    grid, strength = scenes[0].resolution, scenes[0].strength
+    log_stress = strength.log_stress(np.stack([crushing_stress(one.scene, one.bed) for one in points]))
+    complete = None
+    if is_controlled(scenes[0]):
+        complete = [_complete(*one, slices)[0] for one in zip(scenes, log_stress.max(axis=2)[:, None], strict=True)]
+    runs = [(number, replicate) for number, one in enumerate(points) for replicate in one.replicates]
+    step = max(_TOGETHER // (slices.share.size * grid.streamlines * grid.snapshots * grid.cells), 1)
+    found = []
+    for k in range(0, len(runs), step):
+        part = runs[k : k + step]
+        cells = march.march(scenes, log_stress, slices, seed, part, complete is not None)
+        exact = None if complete is None else partial(_of_runs, [complete[number] for number, _ in part])
+        found += _summarised(scenes[0], cells, slices, exact)
+    each = iter(found)
+    return [list(itertools.islice(each, len(one.replicates))) for one in points]
+
+
+def _of_runs(passings: list[Callable], size: np.ndarray) -> np.ndarray:
+    """Return passings (..., slice, run, streamline), each run's own, at sizes that are broadcast against these, m."""
+    found, start = [], 0
+    for passing, same in itertools.groupby(passings):
+        count = len(list(same))
+        own = passing(size=size if size.shape[-2] == 1 else size[..., start : start + count, :])
+        found.append(np.broadcast_to(own, (*own.shape[:-2], count, own.shape[-1])))
+        start += count
+    return np.concatenate(found, axis=-2)
 
 
 def _complete(scene: Scene, highest: np.ndarray, slices: Slices) -> tuple[Callable, Callable]:

@@ -18,7 +18,7 @@ from typing import BinaryIO
 from hpgr.run import run_scene
 from hpgr.scene import Scene
 from studies.sweep.cases import code_version, pack_result, read_packed, result_of
-from studies.sweep.run import Runner, run_point, threads_here
+from studies.sweep.run import Runner, run_cases, threads_here
 from studies.sweep.space import Case, CaseResult, SweepSpec, plain
 
 _START = 300.0  # s that a child may take to start: it may have to compile
@@ -143,7 +143,7 @@ def serve() -> None:
             return
         faulthandler.dump_traceback_later(spec.timeout + _GRACE, exit=True)  # if the driver was killed meanwhile
         case = json.loads(line)
-        [result] = run_point(runner, [Case((), case["values"], case["replicate"])])
+        [result] = run_cases(runner, [Case((), case["values"], case["replicate"])])
         faulthandler.cancel_dump_traceback_later()
         _answer(answers, result)
 

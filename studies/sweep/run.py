@@ -18,7 +18,7 @@ from hpgr.bed.loaded import Beds
 from hpgr.fields import faults_of
 from hpgr.grains import kernels
 from hpgr.results import schema
-from hpgr.run import Result, attributes, run_replicates, run_scene
+from hpgr.run import Result, attributes, run_scene, run_together
 from hpgr.tolerance import refine
 from studies.sweep.cases import Addresses, CaseFolder, code_version, result_of, say
 from studies.sweep.space import Case, CaseResult, Space, SweepSpec
@@ -30,7 +30,7 @@ _SUMMARY = {name: entry for name, entry in _KNOWN.items() if not {"point", "cell
 _AHEAD = 4  # batches in flight for each thread of the workers: enough that none waits for the driver
 _AHEAD_WHOLE = 2  # the same where cases are told whole, which takes memory
 _BATCH = 32  # cases a task holds at most: dask's cost of about 1 ms per task is then under 1 % of a case's
-_TOGETHER = 200_000  # cells of replicates run as one at most: more gain nothing, and take the memory of all
+_TOGETHER = 200_000  # cells, and points, of cases run at once: more gain nothing, and take the memory of all
 _BATCH_SECONDS = 2.0  # predicted for a task at most, so that progress shows and little is lost with a worker
 _PREDICTED = 100  # operating points whose cost is predicted; that of more is scaled up
 _TICK = 0.2  # s between looks at what other drivers have finished
@@ -45,7 +45,7 @@ class OtherCode(RuntimeError):
 
 
 class Runner:
-    """Runs the replicates of one operating point after another, and keeps what the next may share: scene and bed."""
+    """Runs cases, and keeps what the next may share: scene and bed."""
 
     def __init__(self, spec: SweepSpec, at_once: int = 1):
         self.spec = spec
@@ -54,17 +54,21 @@ class Runner:
         self._beds = Beds(1)
         self._room = _room(at_once)
 
-    def run(self, values: dict[str, Any], replicates: list[int]) -> list[Result]:
-        """Return the results of replicates of an operating point, as `hpgr.simulate` would."""
-        if values != self._values:
-            self._values = None  # a refused scene must not be taken for the next replicate's
-            self._prepare(values)
-            self._values = values
-        grid = self._scene.resolution
-        step = max(1, _TOGETHER // max(1, grid.snapshots * grid.streamlines * grid.cells))
-        parts = (replicates[first : first + step] for first in range(0, len(replicates), step))
-        results = (run_replicates(self._scene, self.spec.seed, part, self._beds) for part in parts)
-        return [result._replace(values=result.values | self._chosen) for part in results for result in part]
+    def run(self, cases: list[Case]) -> list[list[Result]]:
+        """Return the results of cases, by operating point, as `hpgr.simulate` would."""
+        points, chosen = [], []
+        for values, point in itertools.groupby(cases, lambda case: case.values):
+            if values != self._values:
+                self._values = None  # a refused scene must not be taken for the next case's
+                self._prepare(values)
+                self._values = values
+            points.append((self._scene, [case.replicate for case in point]))
+            chosen.append(self._chosen)
+        found = run_together(points, self.spec.seed, self._beds)
+        return [
+            [one._replace(values=one.values | more) for one in results] if more else results
+            for results, more in zip(found, chosen, strict=True)
+        ]
 
     def _prepare(self, values: dict[str, Any]) -> None:
         spec = self.spec
@@ -82,28 +86,29 @@ def _room(at_once: int) -> tuple[int, str]:
     return available // at_once, shared
 
 
-def run_point(runner: Runner, cases: list[Case]) -> list[CaseResult]:
-    """Simulate cases of one operating point; whatever happens is told in their results, never raised."""
+def run_cases(runner: Runner, cases: list[Case]) -> list[CaseResult]:
+    """Simulate cases at once; whatever happens is told in their results, never raised."""
     try:
-        results = runner.run(cases[0].values, [case.replicate for case in cases])
+        points = runner.run(cases)
     except Exception as error:  # a fault in one case must not lose the others
-        if len(cases) > 1:  # nor must one replicate the rest
-            return [result for case in cases for result in run_point(runner, [case])]
+        if len(cases) > 1:
+            return [result for case in cases for result in run_cases(runner, [case])]
         refused = isinstance(error, ValueError | MemoryError)
         told = faults_of(error) if isinstance(error, ValidationError) else str(error)
         words = told if refused else f"{type(error).__name__}: {told}"
         return [CaseResult(cases[0].index, "refused" if refused else "failed", words, {})]
-    return list(_told(runner.spec, cases, results))
+    each = iter(cases)
+    return [told for results in points for told in _told(runner.spec, each, results)]
 
 
-def _told(spec: SweepSpec, cases: list[Case], results: list[Result]) -> Iterator[CaseResult]:
+def _told(spec: SweepSpec, cases: Iterator[Case], results: list[Result]) -> Iterator[CaseResult]:
     """Yield what is told of cases of an operating point that came to results."""
     known = _KNOWN if spec.whole else _SUMMARY
     types = {name: known[name].dtype for name in known if results[0].values.get(name) is not None}
     title = "Comminution in high pressure grinding rolls, heterarchical model: one case of a study"
     stored: dict[str, np.ndarray] = {}
     before = results[0].values
-    for case, result in zip(cases, results, strict=True):
+    for result, case in zip(results, cases, strict=False):  # of cases no more are taken
         values = result.values
         stored = {  # what replicates share, which is most, once
             name: stored[name] if stored and values[name] is before[name] else np.asarray(values[name], dtype)
@@ -122,12 +127,13 @@ def _told(spec: SweepSpec, cases: list[Case], results: list[Result]) -> Iterator
 
 
 def run_batch(spec: SweepSpec, cases: list[Case]) -> list[CaseResult]:
-    """Run cases one after the other; this is a task of a worker."""
+    """Run cases, some at once; this is a task of a worker."""
     if spec.code and spec.code != code_version():
         raise OtherCode("a worker's hpgr or libraries differ from the driver's; install the same on both")
-    runner = Runner(spec, threads_here())
-    points = itertools.groupby(cases, key=lambda case: case.values)
-    return [result for _, point in points for result in run_point(runner, list(point))]
+    runner, grid = Runner(spec, threads_here()), spec.base.resolution
+    step = max(1, _TOGETHER // (grid.streamlines * max(grid.snapshots * grid.cells, grid.points)))
+    parts = (cases[first : first + step] for first in range(0, len(cases), step))
+    return [result for part in parts for result in run_cases(runner, part)]
 
 
 def threads_here() -> int:
