@@ -225,7 +225,7 @@ def control():
             scene = new.with_values({"resolution.control_variate": used})
             bed, sieve = load_bed(inputs_of(scene)), scene.resolution.sieves.index(0.001)
             start = time.process_time()
-            crushed = solve.crush(scene, bed, 0, range(1000))
+            [crushed] = solve.crush([solve.Loaded(scene, bed, range(1000))], 0)
             spent[used] = time.process_time() - start
             found[used] = [[*one.total_percentiles, one.passing[:, sieve].mean()] for one in crushed]
         scatter = {used: np.std(each, axis=0) / np.mean(each, axis=0) for used, each in found.items()}

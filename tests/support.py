@@ -46,8 +46,8 @@ def plain(function):
 
 
 def one_by_one(run_scene):
-    """Return what runs replicates by `run_scene`, in the place of `hpgr.run.run_replicates`."""
-    return lambda scene, seed, replicates, beds: [run_scene(scene, seed, one, beds) for one in replicates]
+    """Return what runs cases by `run_scene`, in the place of `hpgr.run.run_together`."""
+    return lambda points, seed, beds: [[run_scene(scene, seed, one, beds) for one in each] for scene, each in points]
 
 
 # An ore between real rolls under the paper's laws, of which closed forms are known: no slip, nothing scatters
@@ -162,7 +162,8 @@ def under(stress, time_step=1.0):
 
 def crush(scene, stress, seed=0, replicate=0):
     """Crush a scene without exchange under a given stress (streamline, point), Pa."""
-    return solve.crush(scene, under(stress), seed, [replicate])[0]
+    [[crushed]] = solve.crush([solve.Loaded(scene, under(stress), [replicate])], seed)
+    return crushed
 
 
 def draw(feed, cells, source):

@@ -29,14 +29,15 @@ PATCH = """
 import os, time
 import hpgr.run
 
-real = hpgr.run.run_replicates
+real = hpgr.run.run_together
 
-def run_replicates(scene, seed, replicates, beds=None):
-    time.sleep(0.05 * len(replicates))
-    if scene.rolls.gap == 0.0405: os._exit(7)
-    return real(scene, seed, replicates, beds)
+def run_together(points, seed, beds=None):
+    for scene, replicates in points:
+        time.sleep(0.05 * len(replicates))
+        if scene.rolls.gap == 0.0405: os._exit(7)
+    return real(points, seed, beds)
 
-hpgr.run.run_replicates = run_replicates
+hpgr.run.run_together = run_together
 """
 
 

@@ -209,7 +209,7 @@ def test_second_run_reads_every_case_back(run, folder, monkeypatch):
     assert "12 cases (4 replicates each), 6 of them finished already in outputs/gap_sweep.cases" in told
     assert sorted(folder.rglob("*")) == before
     assert "finished" not in run("--gap", "40 mm", "--dry-run", "--recompute")[1]
-    monkeypatch.setattr(running, "run_replicates", None)  # calling it would fail the case
+    monkeypatch.setattr(running, "run_together", None)  # calling it would fail the case
     again, out_again, err_again = run(*gaps)
     assert "6 of 9 cases read back from outputs/gap_sweep.cases" in err_again  # refused cases are not kept
     assert (again, out_again) == (code, out)
@@ -258,7 +258,7 @@ def test_lost_cases_are_named_and_exit_code_is_1(run, folder, monkeypatch):
             raise RuntimeError("boom \x1b[2J")
         return real(scene, seed, replicate, beds)
 
-    monkeypatch.setattr(running, "run_replicates", one_by_one(run_scene))
+    monkeypatch.setattr(running, "run_together", one_by_one(run_scene))
     code, out, err = run("--gap", "40 mm", "50 mm", "1.2 m")
     assert code == 1
     [line] = [line for line in err.splitlines() if line.startswith("refused")]

@@ -8,6 +8,7 @@ from support import paper, sized
 
 from hpgr import passing, percentile_size, simulate
 from hpgr.grains import kernels, march, solve
+from hpgr.grains.solve import Loaded
 from hpgr.laws.roll_width import WHOLE
 from hpgr.run import load
 
@@ -37,7 +38,8 @@ def products(values, cells, replicates=REPLICATES, **more):
     scene, bed = load(paper(BASE | {"resolution.cells": cells} | values))
     for used in (True, False):
         chosen = scene.with_values({"resolution.control_variate": used})
-        yield solve.crush(chosen, bed, 0, range(replicates))
+        [crushed] = solve.crush([Loaded(chosen, bed, range(replicates))], 0)
+        yield crushed
 
 
 def figures(crushed):
@@ -91,7 +93,7 @@ def test_passing_rises_within_0_and_1(values, cushioning, cells, snapshots):
 def marched(values, complete):
     scene, bed = load(paper(BASE | values))
     log_stress = scene.strength.log_stress(solve.crushing_stress(scene, bed))
-    found = march.march(scene, log_stress, WHOLE, 0, [0], complete)
+    found = march.march([scene], log_stress[None], WHOLE, 0, [(0, 0)], complete)
     return scene, log_stress, found
 
 
@@ -103,7 +105,7 @@ def test_cells_run_on_to_what_they_come_to_without_cushioning(values):
     assert np.any(found.complete < found.product)
     still = np.repeat(log_stress.max(axis=1, keepdims=True), 100, axis=1)
     free = scene.with_values({"strength.cushioning": "inf"})
-    wanted = march.march(free, np.hstack([log_stress, still]), WHOLE, 0, [0])
+    wanted = march.march([free], np.hstack([log_stress, still])[None], WHOLE, 0, [(0, 0)])
     assert np.array_equal(found.complete, wanted.product)
 
 
@@ -121,7 +123,8 @@ def test_little_cushioning_is_the_closed_form():
         next(iter(found)) for found in products({"strength.cushioning": 100.0, "resolution.points": 400}, 50, 1)
     )
     _, bed = load(paper(BASE | {"resolution.points": 400}))
-    [exact] = solve.crush(paper(BASE | {"resolution.points": 400, "strength.cushioning": "inf"}), bed, 0, [0])
+    free = paper(BASE | {"resolution.points": 400, "strength.cushioning": "inf"})
+    [[exact]] = solve.crush([Loaded(free, bed, [0])], 0)
     off, before = (np.abs(found.passing - exact.passing).max() for found in (corrected, plain))
     assert off < 0.03 < before
 
@@ -149,9 +152,9 @@ def test_what_is_recorded_is_not_corrected(record):
 
 def test_replicates_at_once_are_those_one_by_one():
     scene, bed = load(paper(BASE | {"resolution.cells": 50}))
-    together = solve.crush(scene, bed, 7, [2, 0])
+    [together] = solve.crush([Loaded(scene, bed, [2, 0])], 7)
     for replicate, found in zip((2, 0), together, strict=True):
-        [alone] = solve.crush(scene, bed, 7, [replicate])
+        [[alone]] = solve.crush([Loaded(scene, bed, [replicate])], 7)
         for name in ("passing", "percentiles", "total_percentiles", "breaks", "below_floor"):
             assert np.array_equal(getattr(alone, name), getattr(found, name)), name
 

@@ -173,7 +173,7 @@ def test_cases_in_flight_are_few(base, client, tmp_path, monkeypatch):
         running.discard((json.loads(dataset.attrs["scene"])["rolls"]["gap"], dataset.attrs["replicate"]))
         path.write_bytes(b"x")
 
-    monkeypatch.setattr(run, "run_replicates", one_by_one(run_scene))
+    monkeypatch.setattr(run, "run_together", one_by_one(run_scene))
     monkeypatch.setattr(netcdf, "write_dataset", write)
     sweep(base, {"rolls.gap": [0.04, 0.05, 0.06]}, 10, client=client, folder=tmp_path, record="cells")
     assert not running

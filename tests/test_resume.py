@@ -37,7 +37,7 @@ def counted(monkeypatch):
         seen.append((scene.rolls.gap, replicate))
         return real(scene, seed, replicate, beds)
 
-    monkeypatch.setattr(run, "run_replicates", one_by_one(run_scene))
+    monkeypatch.setattr(run, "run_together", one_by_one(run_scene))
     return seen
 
 
@@ -94,7 +94,7 @@ def test_lost_cases_are_tried_again(base, client, tmp_path, monkeypatch):
         return real(scene, *rest)
 
     with monkeypatch.context() as patch:
-        patch.setattr(run, "run_replicates", one_by_one(run_scene))
+        patch.setattr(run, "run_together", one_by_one(run_scene))
         first = sweep(base, {"rolls.gap": [*GAPS, 1.2]}, client=client, folder=tmp_path)
     assert first["status"].values[:, 0].tolist() == [0, STATUS["failed"], 0, STATUS["refused"]]
     second = sweep(base, {"rolls.gap": [*GAPS, 1.2]}, client=client, folder=tmp_path)
@@ -225,19 +225,20 @@ PATCHED = """
 import os, time
 import hpgr.run
 
-real = hpgr.run.run_replicates
+real = hpgr.run.run_together
 
-def run_replicates(scene, seed, replicates, beds=None):
-    [result] = real(scene, seed, replicates, beds)
+def run_together(points, seed, beds=None):
+    [[result]] = real(points, seed, beds)
+    [[scene, replicates]] = points
     if replicates == [1]:
         if scene.rolls.gap == 0.04: time.sleep(3600)
         if scene.rolls.gap == 0.045: os._exit(3)
         if scene.rolls.gap == 0.05: raise RuntimeError("boom")
         if scene.rolls.gap == 0.055: result.values["p80_total"] = float("nan")
         if scene.rolls.gap == 0.058: os.kill(os.getpid(), 11)
-    return [result]
+    return [[result]]
 
-hpgr.run.run_replicates = run_replicates
+hpgr.run.run_together = run_together
 """
 
 
@@ -370,19 +371,19 @@ _LOGGED = """
 import os, time
 import hpgr.run
 
-real = hpgr.run.run_replicates
+real = hpgr.run.run_together
 log = os.open(os.environ["HPGR_LOG"], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
 
-def run_replicates(scene, seed, replicates, beds=None):
-    for replicate in replicates:
+def run_together(points, seed, beds=None):
+    for scene, replicate in [(scene, one) for scene, replicates in points for one in replicates]:
         case = f"{scene.rolls.gap} {scene.feed.top_size} {replicate}"
         os.write(log, f"{os.getpid()} {case} {time.monotonic_ns()}\\n".encode())
+        time.sleep(0.05)
     while len({line.split()[0] for line in open(os.environ["HPGR_LOG"])}) < 2:  # until the other is at work too
         time.sleep(0.02)
-    time.sleep(0.05 * len(replicates))
-    return real(scene, seed, replicates, beds)
+    return real(points, seed, beds)
 
-hpgr.run.run_replicates = run_replicates
+hpgr.run.run_together = run_together
 """
 _DRIVER = """
 import sys

@@ -1,5 +1,6 @@
 import doctest
 import importlib
+import itertools
 import math
 import pkgutil
 import re
@@ -16,7 +17,7 @@ from hpgr.fields import parts_of, values_of
 from hpgr.grains import closed_form, kernels
 from hpgr.results import flags as limits
 from hpgr.results import schema
-from hpgr.run import load, run_replicates, run_scene
+from hpgr.run import load, run_scene, run_together
 from studies.sweep import sweep
 
 INF = math.inf
@@ -513,7 +514,7 @@ def test_every_caller_runs_the_machine_whose_gap_carries_the_force():
 
 
 @pytest.mark.parametrize("name", ["march", "control variate", "width", "closed form", "exchange", "stress only"])
-def test_a_replicate_has_the_same_bits_alone_and_beside_others(name):
+def test_a_case_has_the_same_bits_alone_and_beside_others(name):
     product = {"resolution.record": "product"}
     scene = paper(
         {
@@ -525,8 +526,18 @@ def test_a_replicate_has_the_same_bits_alone_and_beside_others(name):
             "stress only": {"resolution.cells": 0},
         }[name]
     )
-    for replicate, together in zip((4, 0, 2), run_replicates(scene, 3, [4, 0, 2]), strict=True):
-        alone = run_scene(scene, 3, replicate)
+    # an operating point of another feed, another one of another gap, and one that shares no call of the kernels
+    scenes = [
+        scene,
+        *(
+            scene.with_values(other)
+            for other in ({"feed.top_size": 0.05}, {"rolls.gap": 0.055}, {"fragments.exponent": 0.5})
+        ),
+    ]
+    found = run_together([(one, [4, 0, 2]) for one in scenes], 3)
+    every = [(one, replicate) for one in scenes for replicate in (4, 0, 2)]
+    for (one, replicate), together in zip(every, itertools.chain(*found), strict=True):
+        alone = run_scene(one, 3, replicate)
         assert together.diagnostics == alone.diagnostics
         assert together.values.keys() == alone.values.keys()
         for key, value in alone.values.items():

@@ -225,7 +225,7 @@ def run_scene(monkeypatch):
 
     def patch(other):
         real = run.run_scene
-        monkeypatch.setattr(run, "run_replicates", one_by_one(lambda *case: other(real, *case)))
+        monkeypatch.setattr(run, "run_together", one_by_one(lambda *case: other(real, *case)))
 
     return patch
 
@@ -284,27 +284,27 @@ def test_case_that_is_not_finite_loses_itself_only(base, client, good, run_scene
 
 
 def test_lost_task_loses_its_batch_only(base, client, good, monkeypatch):
-    real = run.run_point
+    real = run.run_cases
 
-    def run_point(runner, cases):
+    def run_cases(runner, cases):
         if (1, 0) in (case.index for case in cases):
             raise SystemError("worker lost")
         return real(runner, cases)
 
-    monkeypatch.setattr(run, "run_point", run_point)
+    monkeypatch.setattr(run, "run_cases", run_cases)
     result = sweep(base, {"rolls.gap": GAPS}, replicates=4, client=client)
     lost_only(result, good, (1, 0), "failed", "SystemError", "worker lost")
 
 
 @pytest.mark.parametrize(("cells", "together"), [(1, 1), (10**6, 3)])
-def test_replicates_run_as_one_as_far_as_memory_goes(base, client, good, monkeypatch, cells, together):
-    real, most = run.run_replicates, []
+def test_cases_run_at_once_as_far_as_memory_goes(base, client, good, monkeypatch, cells, together):
+    real, most = run.run_together, []
 
-    def run_replicates(scene, seed, replicates, beds):
-        most.append(len(replicates))
-        return real(scene, seed, replicates, beds)
+    def run_together(points, seed, beds):
+        most.append(sum(len(replicates) for _, replicates in points))
+        return real(points, seed, beds)
 
-    monkeypatch.setattr(run, "run_replicates", run_replicates)
+    monkeypatch.setattr(run, "run_together", run_together)
     monkeypatch.setattr(run, "_TOGETHER", cells)
     assert sweep(base, {"rolls.gap": GAPS}, replicates=4, client=client).identical(good)
     assert max(most) == together  # of batches of three

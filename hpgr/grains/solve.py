@@ -260,7 +260,10 @@ def _summarised(scene: Scene, cells: Cells, slices: Slices, exact: Callable | No
         for _ in range(2):  # the first read is off by the cells' own scatter, the second by little
             fractions = control.fractions(percentiles, shares)
             percentiles = [_quantiles(one, at) for one, at in zip(mixed, fractions, strict=True)]
-    combined = np.tensordot(slices.share, passing, axes=1)
+    by_run = np.ascontiguousarray(
+        passing.swapaxes(0, 1)
+    )  # each run's product of its own: their number leaves bits alone
+    combined = (slices.share @ by_run.reshape(*by_run.shape[:2], -1)).reshape(by_run.shape[0], *by_run.shape[2:])
     breaks = slices.share @ (cells.breaks.reshape(len(cells.breaks), slices.share.size, -1) / pooled.shape[-1])
     total_passing = combined[..., 1:].mean(axis=1)
     of_all, of_whole, *of_zones = percentiles
