@@ -30,7 +30,7 @@ def crushed(feed: Feed, strength: Strength, fragments: Fragments, critical: np.n
     `critical` is any array of critical sizes, m, held at the size floor or above; sizes are broadcast against it.
     """
     if math.isinf(strength.scatter) and fragments.size_exponent == 0:
-        passing = partial(crushed_passing, feed, critical=critical, gamma=fragments.exponent)
+        passing = partial(_crushed_passing, feed, critical, fragments.exponent, 1 - feed.passing(critical))
         return passing, partial(expected_breaks, feed, critical, fragments.exponent)
     edges, cumulative, breaks = _cascade(feed, strength, fragments, critical.ravel())
     breaks = breaks.reshape(critical.shape)
@@ -98,8 +98,13 @@ def crushed_passing(feed: Feed, size, critical, gamma: float) -> np.ndarray:
     >>> closed_form.crushed_passing(SingleFeed(size="50 mm"), [1e-3, 4e-3, 8e-3], 8e-3, gamma=1)
     array([0.125, 0.5  , 1.   ])
     """
-    size, critical = np.asarray(size, dtype=float), np.asarray(critical, dtype=float)
-    crushed = (1 - feed.passing(critical)) * np.minimum(size / critical, 1.0) ** gamma  # 0 where s_c is inf
+    critical = np.asarray(critical, dtype=float)
+    return _crushed_passing(feed, critical, gamma, 1 - feed.passing(critical), np.asarray(size, dtype=float))
+
+
+def _crushed_passing(feed: Feed, critical: np.ndarray, gamma: float, coarse: np.ndarray, size) -> np.ndarray:
+    """As `crushed_passing`, given the coarse part of the feed, 1 - F0(s_c)."""
+    crushed = coarse * np.minimum(size / critical, 1.0) ** gamma  # 0 where s_c is inf
     return np.where(size < critical, feed.passing(size) + crushed, 1.0)
 
 

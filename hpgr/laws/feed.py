@@ -65,7 +65,7 @@ class UniformFeed(_Distribution):
             yield Fault("bottom_size", show(bottom, "m"), bound, "give a range, or use kind 'single'")
 
     def _passing(self, size):
-        return np.clip((size - self.bottom_size) / (self.top_size - self.bottom_size), 0.0, 1.0)
+        return np.minimum(np.maximum((size - self.bottom_size) / (self.top_size - self.bottom_size), 0.0), 1.0)
 
     def _quantile(self, fraction):
         return self.bottom_size + (self.top_size - self.bottom_size) * fraction
