@@ -18,7 +18,7 @@ from hpgr.laws.roll_width import Slices
 from hpgr.scene import Scene
 
 _LARGE = 200_000  # cells of all parcels from which they are crushed on all cores
-AT_ONCE = 20_000  # cells of the parcels of a call, whose work space then stays in cache
+AT_ONCE = 50_000  # cells of the parcels of a call, whose work space then stays in cache
 
 
 class Cells(NamedTuple):
