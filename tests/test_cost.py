@@ -38,6 +38,7 @@ def test_cost_grows_with_every_size(name):
 def test_scene_beyond_the_memory_is_refused_with_bytes_bound_and_remedy(monkeypatch):
     scene = paper()
     needed = cost.predict(scene).bytes
+    monkeypatch.setattr(cost, "_SLIGHT", needed)
     monkeypatch.setattr(cost, "available_memory", lambda: (needed, "physical memory"))
     with pytest.raises(MemoryError) as error:
         cost.refuse_too_large(scene)
@@ -51,6 +52,13 @@ def test_scene_beyond_the_memory_is_refused_with_bytes_bound_and_remedy(monkeypa
         assert words in text
     monkeypatch.setattr(cost, "available_memory", lambda: (2 * needed, "physical memory"))
     cost.refuse_too_large(scene)
+
+
+def test_of_a_slight_scene_the_system_is_not_asked(monkeypatch):
+    monkeypatch.setattr(cost, "available_memory", None)  # asking would raise
+    cost.refuse_too_large(paper())
+    with pytest.raises(TypeError):
+        cost.refuse_too_large(paper({"resolution.points": 10_000}))
 
 
 def test_largest_scene_is_refused():
@@ -126,8 +134,9 @@ def test_groups_that_cannot_be_seen_do_not_count(monkeypatch, tmp_path, own):
     assert cost.available_memory()[1] == "physical memory"
 
 
-def test_refusal_names_the_group_that_it_was_held_against(groups):
+def test_refusal_names_the_group_that_it_was_held_against(groups, monkeypatch):
     needed = cost.predict(paper()).bytes
+    monkeypatch.setattr(cost, "_SLIGHT", 0)
     groups("job/step", needed + 100, 100)
     with pytest.raises(MemoryError, match=f"80% of the {needed:,} bytes that the memory limit of cgroup /job/step"):
         cost.refuse_too_large(paper())
