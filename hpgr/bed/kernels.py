@@ -22,8 +22,11 @@ _inner = njit(**_HOW, no_cpython_wrapper=True)  # not to be called from Python: 
 _PANELS = 64  # 5-point Gauss on 64 panels: travel times to 1e-13 for every entry_fraction down to 1e-9
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
+# of values at the nodes to the coefficients of u, u^2 .. of the integral from 0 to u of the quartic through them
+_INTEGRAL = np.linalg.inv(np.vander(_NODES, increasing=True)) / np.arange(1, 6)[:, None]
 _DENSEST = 0.99  # of the largest solid fraction, where a bed that stiffens as pores close is held
-_TENSION_NOISE = 1e-9  # of the largest stress; less is rounding of the running sum
+
+_MET = 1e-7  # of the mean slowness of a panel, by which a quartic may miss that at its ends
 
 
 class Line(NamedTuple):
@@ -121,7 +124,8 @@ def _at(line, flow, place):
     """
     if flow.nip_angle > 0.0:
         return line.height * place, 1.0 - place
-    return -line.height * math.expm1(-place), math.exp(-place)
+    depth = math.exp(-place)
+    return line.height * (1.0 - depth), depth
 
 
 @_inner
@@ -142,22 +146,38 @@ def _travel(line, flow, start, length):
 
 @_inner
 def _march_back(line, flow, edges, duration, places):
-    """Fill the places of a streamline's points, equal times apart, by Newton's method inside their panels."""
+    """Fill the places of a streamline's points, equal times apart.
+
+    Inside a panel time is the integral of a quartic, right to 1e-9 of a panel's where the quartic meets the slowness
+    at the panel's ends; where it does not, by Newton's method on the quadrature.
+    """
     last = j = places.size - 1
     passed, slow = 0.0, _slowness(line, flow, edges[0])
     for k in range(_PANELS):
         start, width, slow_start = edges[k], edges[k + 1] - edges[k], slow
-        time, slow = _travel(line, flow, start, width), _slowness(line, flow, edges[k + 1])
+        first = second = third = fourth = fifth = 0.0
+        for m in range(_NODES.size):
+            at_node = width * _slowness(line, flow, start + width * _NODES[m])
+            first += _INTEGRAL[0, m] * at_node
+            second += _INTEGRAL[1, m] * at_node
+            third += _INTEGRAL[2, m] * at_node
+            fourth += _INTEGRAL[3, m] * at_node
+            fifth += _INTEGRAL[4, m] * at_node
+        time, slow = first + second + third + fourth + fifth, _slowness(line, flow, edges[k + 1])
+        end = first + 2.0 * second + 3.0 * third + 4.0 * fourth + 5.0 * fifth
+        met = abs(first - width * slow_start) + abs(end - width * slow) < _MET * time
+        low, high = time / (width * slow_start) - 1.0, time / (width * slow) - 1.0
         while j >= 0 and (duration * ((last - j) / last) < passed + time or k == _PANELS - 1):
             left = duration * ((last - j) / last) - passed
             # the cubic through the panel's ends with their slopes is 1e-6 off; each pass squares that
-            u, low, high = left / time, time / slow_start - width, time / slow - width
-            length = u * (width + (1.0 - u) * (low * (1.0 - u) - high * u))
-            for _ in range(4):
+            u = left / time
+            u *= 1.0 + (1.0 - u) * (low * (1.0 - u) - high * u)
+            miss = u * (first + u * (second + u * (third + u * (fourth + u * fifth)))) - left
+            u -= miss / (first + u * (2.0 * second + u * (3.0 * third + u * (4.0 * fourth + u * 5.0 * fifth))))
+            length = u * width
+            for _ in range(0 if met else 4):
                 miss = _travel(line, flow, start, length) - left
                 length -= miss / _slowness(line, flow, start + length)
-                if abs(miss) <= 1e-7 * time:
-                    break
             places[j] = start + length
             j -= 1
         passed += time

@@ -18,6 +18,7 @@ _NARROWEST = 1e-4  # gap over diameter below which no operating gap is looked fo
 _PRECISION = 1e-9  # relative, of the force that an operating gap is found for
 _NO_FORCE = 1e-6  # of the wanted force; less counts as this much
 _CARRIED = 1e-6  # relative error of the force at the gap found
+_HALVES = 4  # steps of a search that are the same for any force
 _TRIED = 65  # gaps among which the bed that presses most is looked for
 
 
@@ -162,28 +163,39 @@ def _gap_carrying(inputs: BedInputs, wanted: float) -> float:
 def _force_at(inputs: BedInputs) -> Callable[[float], float]:
     """Return the force over diameter and width, Pa, as a function of the log of the gap, m.
 
-    It keeps what it has found: of the nine gaps that a search takes the ends are the same for any force.
+    It keeps what it has found: of the nine gaps that a search takes, six are the same for any force.
     """
     return lru_cache(64)(lambda log_gap: _force_over_diameter(inputs._replace(gap=math.exp(log_gap))))
 
 
 def _root(function: Callable[[float], float], low: float, high: float) -> float:
-    """Return where a function changes its sign, by the regula falsi of Anderson & Bjorck.
+    """Return where a falling function changes its sign: by halves, then by inverse quadratic interpolation (Brent).
 
-    Of the nearly straight force six evaluations give nine digits, as of scipy.optimize, which takes 0.3 s to load.
+    Halves first, whose ends do not depend on the force. Where interpolation does not gain, as at a jump, by halves too.
     """
-    at_low, at_high = function(low), function(high)
-    for _ in range(200):
-        if abs(at_high) < _PRECISION or abs(high - low) < _PRECISION / 1000:
-            break
-        guess = high - at_high * (high - low) / (at_high - at_low)
+    known = [(function(low), low), (function(high), high)]
+    halves, found = _HALVES, math.inf
+    while abs(found) >= _PRECISION and high - low >= _PRECISION / 1000:
+        guess, last = (low + high) / 2, found
+        if halves == 0:
+            nearest = sorted(known, key=lambda one: abs(one[0]))[:3]
+            between = _inverse(nearest)
+            guess = between if low < between < high else guess
         found = function(guess)
-        if found * at_high < 0:
-            low, at_low = high, at_high
-        else:
-            at_low *= max(1 - found / at_high, 0.0) or 0.5
-        high, at_high = guess, found
-    return high
+        halves = halves - 1 if halves > 0 else int(abs(found) > abs(last) / 2)
+        known.append((found, guess))
+        low, high = (guess, high) if found > 0 else (low, guess)
+    return min(known, key=lambda one: abs(one[0]))[1]
+
+
+def _inverse(known: list[tuple[float, float]]) -> float:
+    """Return the place at which the polynomial through values at places is 0, taken as a function of the value."""
+    values = {value for value, _ in known}
+    if len(values) < len(known):
+        return math.nan
+    return sum(
+        place * math.prod(other / (other - value) for other in values if other != value) for value, place in known
+    )
 
 
 def _refused(wanted: float) -> str:
