@@ -95,7 +95,7 @@ def _descent(line, flow, y, depth):
 
 @_inner
 def _rates(line, flow, y, depth):
-    """Return |v| / U, volumetric (compaction positive) and triaxial shear strain rate in U/H, and `across`.
+    """Return |v| / U, volumetric (compaction positive) and shear strain rate in U/H, `across`, and X |v_y| / U, m.
 
     The velocity follows the streamline; its direction varies with x at fixed y because xi does. `across` is
     n.(-e').n over the shear rate, n normal to the streamline and e' the strain rate's deviator: 1 in uniaxial
@@ -112,7 +112,7 @@ def _rates(line, flow, y, depth):
     shear = math.sqrt(2.0 / 3.0 * (xx * xx + yy * yy + third * third + 2.0 * xy * xy))
     across = (2.0 * t * xy - xx - t * t * yy) / ((1.0 + t * t) * shear) if shear > 0.0 else 0.0
     # above a nip 0 by construction: what is left is rounding
-    return speed, 0.0 if flow.nip_angle > 0.0 and y > line.nip else -(v_xx + v_yy), shear, across
+    return speed, 0.0 if flow.nip_angle > 0.0 and y > line.nip else -(v_xx + v_yy), shear, across, outer * fall
 
 
 @_inner
@@ -203,19 +203,21 @@ def _strain(i, line, flow, unit_time, time_step, places, y, volumetric_rate, she
             past = share * time_step
         elif flow.nip_angle > 0.0 and y[i, j - 1] > line.nip:
             past = unit_time * _travel(line, flow, places[j], nip - places[j]) if y[i, j] < line.nip else 0.0
-            _, first_volumetric, first_shear, _ = _rates(line, flow, line.nip, 1.0 - nip)
+            _, first_volumetric, first_shear, _, _ = _rates(line, flow, line.nip, 1.0 - nip)
             first_volumetric, first_shear = first_volumetric / unit_time, first_shear / unit_time
         volumetric[i, j] = (volumetric_rate[i, j] + first_volumetric) * past / 2.0
         shear[i, j] = (shear_rate[i, j] + first_shear) * past / 2.0
 
 
 @_compiled
-def lay(bed, nip, flow, surface_speed, edges, places, y, speed, volumetric_rate, shear_rate, across, volumetric, shear):
+def lay(
+    bed, nip, flow, surface_speed, edges, places, y, speed, volumetric_rate, shear_rate, across, flux, volumetric, shear
+):
     """Lay the material points; return the time step, s, and the closest that neighbours come in height, m.
 
     `edges` are the places between panels of quadrature, exit to entry, `nip` the height of the nip, m, and `places`
-    (point,) work space. Fills heights, m, speeds, m/s, strain rates, 1/s, and `across` of the points, and the strains
-    of the step that ends at each.
+    (point,) work space. Fills heights, m, speeds, m/s, strain rates, 1/s, `across` and flux, m2/s, of the points, and
+    the strains of the step that ends at each.
     """
     lines, points = y.shape
     middle = _line(bed, flow, nip, 0.0)
@@ -228,8 +230,8 @@ def lay(bed, nip, flow, surface_speed, edges, places, y, speed, volumetric_rate,
         _march_back(line, flow, edges, duration, places)
         for j in range(points):
             y[i, j], depth = _at(line, flow, places[j])
-            relative, volume, sheared, across[i, j] = _rates(line, flow, y[i, j], depth)
-            speed[i, j] = surface_speed * relative
+            relative, volume, sheared, across[i, j], sunk = _rates(line, flow, y[i, j], depth)
+            speed[i, j], flux[i, j] = surface_speed * relative, surface_speed * sunk
             volumetric_rate[i, j], shear_rate[i, j] = volume / unit_time, sheared / unit_time
             if j > 0 and y[i, j - 1] - y[i, j] < closest:
                 closest = y[i, j - 1] - y[i, j]

@@ -29,6 +29,8 @@ class Kinematics(NamedTuple):
     across : ndarray
         Normal to the streamline, the deviator of the strain rate over the shear rate: 1 in uniaxial compaction.
         With stress and strain rate coaxial the normal stress on the streamline is p + 2 q / 3 times this.
+    flux : ndarray
+        X |v_y|, the area that sinks per time at this height between mid-plane and roll at the speed here, m2/s.
     time_step : float
         Time between neighbouring points, s.
     """
@@ -40,6 +42,7 @@ class Kinematics(NamedTuple):
     volumetric_rate: np.ndarray
     shear_rate: np.ndarray
     across: np.ndarray
+    flux: np.ndarray
     time_step: float
 
 
@@ -58,17 +61,17 @@ def move(geometry: Geometry, flow: FlowConstants, surface_speed: float, points: 
     ValueError
         If neighbouring points are closer than 1e-9 of the bed's height.
     """
-    y, speed, *rates, across, volumetric, shear = np.zeros((7, geometry.xi.size, points))
+    y, speed, *rates, across, flux, volumetric, shear = np.zeros((8, geometry.xi.size, points))
     time_step = 0.0
     if geometry.height > 0:
         nip, edges = nip_height(geometry, flow), _panels(geometry, flow)
-        laid = np.empty(points), y, speed, *rates, across, volumetric, shear
+        laid = np.empty(points), y, speed, *rates, across, flux, volumetric, shear
         time_step, closest = kernels.lay(geometry, nip, flow, surface_speed, edges, *laid)
         _refuse_coinciding(closest / geometry.height, points, flow.entry_fraction)
     else:  # gap = entry gap: no bed to compact; every point is the exit
         speed += surface_speed
     x, residence_time = geometry.xi[:, None] * geometry.outer(y), np.arange(points) * time_step
-    return Kinematics(x, y, residence_time, speed, *rates, across, time_step), StepStrains(volumetric, shear)
+    return Kinematics(x, y, residence_time, speed, *rates, across, flux, time_step), StepStrains(volumetric, shear)
 
 
 def nip_height(geometry: Geometry, flow: FlowConstants) -> float:

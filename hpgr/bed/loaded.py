@@ -159,18 +159,16 @@ def _power(inputs: BedInputs, geometry: Geometry, motion: Kinematics, strains: S
     Of the mid-plane's side the area between two points is X |v_y| dt / N.
     """
     tubes = geometry.xi.size - 1
-    slope = geometry.xi[:, None] * geometry.slope(motion.y)
-    flux = geometry.outer(motion.y) * motion.speed / np.sqrt(1 + slope * slope)  # X |v_y|, m2/s
-    flux *= inputs.mean_pressure(geometry, motion.y)
 
     def between(field):
-        return (field[:tubes, 1:] + field[:tubes, :-1]) / 2
+        return field[:tubes, 1:] + field[:tubes, :-1]  # twice the mean
 
     volumetric, shear = (part[:tubes, 1:] for part in strains)
     work = between(state.pressure) * volumetric + between(state.shear_stress) * shear
+    work *= between(motion.flux * inputs.mean_pressure(geometry, motion.y))
     given_back = inputs.elasticity.recovered_energy(_on_roll(motion, state)[-1])
     given_back *= inputs.gap * inputs.surface_speed * inputs.mean_pressure(geometry, 0.0, 2.0)
-    done = 2 / tubes * (between(flux) * work).sum(where=volumetric > 0)
+    done = 0.5 / tubes * work.sum(where=volumetric > 0)
     return float(max(done - given_back, 0.0))  # no cake gives back more than was put in
 
 
