@@ -20,7 +20,7 @@ def loaded_path(scene, steps, volumetric_rate, time_step):
     """March one streamline through the strains of `steps`; positions do not matter to the stress."""
     still = np.zeros((1, len(volumetric_rate)))
     motion = Kinematics(
-        still, still, still[0], still, np.asarray(volumetric_rate, float)[None], still, still, time_step
+        still, still, still[0], still, np.asarray(volumetric_rate, float)[None], *[still] * 3, time_step
     )
     _, *elastic = inputs_of(scene).laws()
     return stress.load(*elastic, motion, StepStrains(*(np.append(0.0, step)[None] for step in steps)))
