@@ -36,6 +36,7 @@ class Flag(NamedTuple):
     bit: int  # of the variable `flags`
     meaning: str  # what it says of any run
     hit: Callable[[Run], bool | str]  # whether a run hit it, or a sentence with its figures
+    own: bool = False  # whether replicates differ in it
 
 
 class Usual(NamedTuple):
@@ -68,10 +69,14 @@ def diagnose(
 ) -> list[dict[str, str]]:
     """Return for each product of a bed, by flag, a sentence for each limit that its run hit."""
 
-    @cache  # replicates hardly ever differ
+    @cache
+    def shared(broken: bool | None) -> dict[str, bool | str]:
+        run = Run(scene, bed, performance, broken, 0.0)
+        return {flag.name: flag.hit(run) for flag in FLAGS if not flag.own}
+
     def found(broken: bool | None, below_floor: float) -> dict[str, str]:
-        run = Run(scene, bed, performance, broken, below_floor)
-        hits = ((flag, flag.hit(run)) for flag in FLAGS)
+        run, known = Run(scene, bed, performance, broken, below_floor), shared(broken)
+        hits = ((flag, flag.hit(run) if flag.own else known[flag.name]) for flag in FLAGS)
         return {flag.name: words if isinstance(words, str) else flag.meaning for flag, words in hits if words}
 
     return [
@@ -208,7 +213,7 @@ FLAGS = (  # in the order in which they are told
     Flag("no_breakage", 1, "no grain broke: the product is the feed", lambda run: run.broken is False),
     Flag("feed_below_critical", 1024, "part of the feed is finer than any stress breaks", _feed_below_critical),
     Flag("fragment_exponent_held", 2048, "the exponent of fragments left its range", _fragment_exponent_held),
-    Flag("size_floor_reached", 16, "part of the product is below the size floor", _size_floor_reached),
+    Flag("size_floor_reached", 16, "part of the product is below the size floor", _size_floor_reached, True),
     Flag("few_cells", 32, "of 2 or 3 cells each neighbours every other; use more", _few_cells),
 )
 BITS = {flag.name: flag.bit for flag in sorted(FLAGS, key=lambda flag: flag.bit)}
