@@ -78,17 +78,16 @@ def first_cells(scene: Scene, seed: int, keys: list[tuple[int, ...]], quantile: 
     uniforms = np.empty((len(keys), scene.resolution.cells))
     parcels = kernels.make_parcels(*uniforms.shape, scattered=np.isfinite(scene.strength.scatter))
     kernels.start_parcels(bases, ore(scene), uniforms, parcels.streams, parcels.weakness)
-    sizes = (quantile or scene.feed.quantile)(uniforms).astype(np.float32)
-    parcels.sizes[:, 1:-1] = np.maximum(sizes, np.float32(kernels.SMALLEST))
+    sizes = (quantile or scene.feed.quantile)(uniforms)
+    np.maximum(sizes, kernels.SMALLEST, out=parcels.sizes[:, 1:-1], casting="same_kind")
     return parcels
 
 
 def _quantiles(feeds: list[tuple[Feed, int]], uniforms: np.ndarray) -> np.ndarray:
     """Return the sizes that uniforms (parcel, cell) stand for, given each feed and the number of its parcels."""
     ends = itertools.accumulate(count for _, count in feeds)
-    return np.concatenate(
-        [feed.quantile(uniforms[end - count : end]) for (feed, count), end in zip(feeds, ends, strict=True)]
-    )
+    found = [feed.quantile(uniforms[end - count : end]) for (feed, count), end in zip(feeds, ends, strict=True)]
+    return found[0] if len(found) == 1 else np.concatenate(found)  # replicates have one: 3 % of a case
 
 
 @contextmanager
