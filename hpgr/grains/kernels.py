@@ -856,7 +856,7 @@ def _swap_sparsely(sizes, weakness, lower, upper, first, last, number, state, dr
 
 
 @_compiled
-def swap(parcels, slots, edges, means, largest, key, first, last, numbers, quarters, hits):
+def swap(parcels, slots, edges, means, largest, key, first, last, share, numbers, quarters, hits):
     """Swap cells of equal index across the edges, from a first place to before a last; return the number of swaps.
 
     A cell of size a below and one of size b above an edge swap with probability
@@ -876,13 +876,13 @@ def swap(parcels, slots, edges, means, largest, key, first, last, numbers, quart
         Mean size of each parcel, m, held during the time step.
     largest, key : float, uint64
         Bound of all sizes, m; key of the time step, of which every share of the places makes a stream of its own.
-    first, last : int
-        Places.
-    numbers, quarters, hits : uint64 (cell / 4 + 1,), uint16 (cell + 4,), bool (cell,)
-        Work space for these places; `quarters` are the bits of `numbers`; no `hits` where strengths do not scatter.
+    first, last, share : int
+        Places, and how many at most are a share.
+    numbers, quarters, hits : uint64 (share / 4 + 1,), uint16 (share + 4,), bool (share,)
+        Work space; `quarters` are the bits of `numbers`; no `hits` where strengths do not scatter.
     """
     sizes, weakness, outdated = parcels.sizes, parcels.weakness, parcels.bounds_outdated
-    total, share = 0, mix(key + np.uint64(first) * _GOLDEN)
+    total = 0
     for turn in range(edges.turns.size):
         e = edges.turns[turn]
         lower, upper = slots[edges.pairs[e, 0]], slots[edges.pairs[e, 1]]
@@ -891,20 +891,21 @@ def swap(parcels, slots, edges, means, largest, key, first, last, numbers, quart
         most = _chance(largest, 0.0, drive)
         if most <= 0.0:
             continue
-        state = share + np.uint64(turn + 1) * _GOLDEN
-        if most > DENSE:
-            _fill_numbers(numbers, mix(state))
-            swaps = np.int64(_swap_densely(sizes, lower, upper, first, last, drive, quarters, hits))
-            _follow(weakness, lower, upper, first, last, hits)
-        else:
-            number = uniform(state)
-            if number < 1.0 - (last - first) * most:  # the first candidate lies past the last cell: no logarithm needed
+        before = total
+        for start in range(first, last, share):
+            stop = start + share if start + share < last else last
+            state = mix(key + np.uint64(start) * _GOLDEN) + np.uint64(turn + 1) * _GOLDEN
+            if most > DENSE:
+                _fill_numbers(numbers, mix(state))
+                total += np.int64(_swap_densely(sizes, lower, upper, start, stop, drive, quarters, hits))
+                _follow(weakness, lower, upper, start, stop, hits)
                 continue
-            state = mix(state)
-            swaps = _swap_sparsely(sizes, weakness, lower, upper, first, last, number, state, drive, most)
-        if swaps > 0:
+            number = uniform(state)
+            if number >= 1.0 - (stop - start) * most:  # or the first candidate lies past the last: no logarithm needed
+                state = mix(state)
+                total += _swap_sparsely(sizes, weakness, lower, upper, start, stop, number, state, drive, most)
+        if total > before:
             outdated[lower] = outdated[upper] = True
-            total += swaps
     return total
 
 

@@ -5,7 +5,6 @@ it, among unbroken feed, the mean field of the same swaps is exact in the limit 
 """
 
 import math
-import os
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -162,8 +161,8 @@ class Lattice:
     steady : dict
         Time step -> number of the steady snapshot taken then. The parcel that is at the exit then has the key of the
         same snapshot without exchange, so that both share their random numbers.
-    each : callable
-        A map over parts of the work.
+    cores : Cores
+        What the work is shared between.
     entering : callable, optional
         Quantile function (streamline, ...) of what enters; the feed's if not given.
 
@@ -185,16 +184,16 @@ class Lattice:
         seed: int,
         replicate: int,
         steady: dict[int, int],
-        each: Callable = map,
+        cores: march.Cores = march.ONE,
         entering: Callable | None = None,
     ):
-        self._scene, self._rates, self._steady, self._each = scene, rates, steady, each
+        self._scene, self._rates, self._steady, self._each = scene, rates, steady, cores.each
         self._seed, self._replicate = seed, replicate
         self._path, self._ore = march.path(scene, log_stress), march.ore(scene)
         self._breaking = can_break(scene, self._path).ravel()
         cells, scattered = scene.resolution.cells, math.isfinite(scene.strength.scatter)
         self.parcels = kernels.make_parcels(log_stress.size, cells, scattered)
-        self._works = [kernels.make_work(cells) for _ in range(os.cpu_count() or 1)]
+        self._works = [kernels.make_work(cells) for _ in range(cores.count)]
         self._home = np.arange(log_stress.size).reshape(log_stress.shape)
         self.slots = self._home
         self._entering = entering
@@ -263,14 +262,15 @@ class Lattice:
         self.most_substeps = max(self.most_substeps, most)
         key = np.uint64(kernels.mix(np.uint64((self._swap_key + (step + 1) * 0xD1342543DE82EF95) % 2**64)))
 
-        def swap(first):
-            last = min(first + _SHARE, cells + 1)
-            numbers = np.empty((last - first) // 4 + 1, np.uint64)
-            hits = None if self.parcels.weakness is None else np.empty(last - first, bool)
+        def swap(first, last):
+            numbers = np.empty(_SHARE // 4 + 1, np.uint64)
+            hits = None if self.parcels.weakness is None else np.empty(_SHARE, bool)
             work = numbers, numbers.view(np.uint16), hits
-            return kernels.swap(self.parcels, slots, edges, means, largest, key, first, last, *work)
+            return kernels.swap(self.parcels, slots, edges, means, largest, key, first, last, _SHARE, *work)
 
-        self.swaps += sum(self._each(swap, range(1, cells + 1, _SHARE)))
+        shares = np.array_split(np.arange(1, cells + 1, _SHARE), len(self._works))
+        ends = [(int(part[0]), min(int(part[-1]) + _SHARE, cells + 1)) for part in shares if part.size]
+        self.swaps += sum(self._each(swap, *zip(*ends, strict=True)))
 
 
 class Above(NamedTuple):
@@ -350,9 +350,9 @@ def run(
     steps = [*(range(0, last, wishes.interval) if wishes.record_startup else ()), *steady]
     sieves, mine = march.cell_sieves(scene), np.ascontiguousarray(log_stress[:, first:])
     sizes, classes, product, breaks = [], [], [], np.zeros(log_stress.shape[0], np.int64)
-    with march.cores(mine.size * grid.cells) as each:
+    with march.cores(mine.size * grid.cells) as cores:
         numbers = {step: k for k, step in enumerate(steady)}
-        lattice = Lattice(scene, mine, rates, seed, replicate, numbers, each, entering)
+        lattice = Lattice(scene, mine, rates, seed, replicate, numbers, cores, entering)
         for step in range(steps[-1] + 1):
             before = lattice.swaps
             lattice.advance(step)

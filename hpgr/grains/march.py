@@ -90,15 +90,26 @@ def _quantiles(feeds: list[tuple[Feed, int]], uniforms: np.ndarray) -> np.ndarra
     return found[0] if len(found) == 1 else np.concatenate(found)  # replicates have one: 3 % of a case
 
 
+class Cores(NamedTuple):
+    """Threads that share work, and the map over its parts."""
+
+    count: int
+    each: Callable
+
+
+ONE = Cores(1, map)
+
+
 @contextmanager
-def cores(cells: int) -> Iterator[Callable]:
-    """Give a map over parts of the work: on all cores where there are many cells, and nobody else has the cores."""
+def cores(cells: int) -> Iterator[Cores]:
+    """Give all cores where there are many cells, and nobody else has the cores."""
     # only for a caller of hpgr.simulate: the worker threads of a study have the cores already
     if cells >= _LARGE and threading.current_thread() is threading.main_thread():
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            yield pool.map
+        count = os.cpu_count() or 1
+        with ThreadPoolExecutor(count) as pool:
+            yield Cores(count, pool.map)
     else:
-        yield map
+        yield ONE
 
 
 def march(
@@ -164,8 +175,8 @@ def march(
             ends[part] = parcels.sizes[:, 1:-1]
 
     step = max(AT_ONCE // grid.cells, 1)
-    with cores(product.size) as each:
-        list(each(crush, [slice(k, k + step) for k in range(0, len(keys), step)]))
+    with cores(product.size) as shared:
+        list(shared.each(crush, [slice(k, k + step) for k in range(0, len(keys), step)]))
     breaks = breaks.reshape(shape).sum(axis=1)
     parts = product, record.snapshots, record.classes, ends
     product, *kept = (None if part is None else part.reshape(*shape, *part.shape[1:]) for part in parts)
