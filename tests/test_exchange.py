@@ -271,7 +271,7 @@ class Column:
             before, key = self.sizes.copy(), next(self.keys)
             self.parcels.bounds_outdated[:] = False
             for part in np.array_split(np.arange(1, cells + 1), shares):
-                places = part[0], part[-1] + 1, numbers, numbers.view(np.uint16), hits
+                places = part[0], part[-1] + 1, part.size, numbers, numbers.view(np.uint16), hits
                 swaps += kernels.swap(self.parcels, self.slots, edges, self.means, before.max(), key, *places)
             assert self.parcels.bounds_outdated[np.any(before != self.sizes, axis=1)].all()
         return swaps
@@ -448,16 +448,18 @@ def test_slots_decide_which_parcels_swap():
 
 @pytest.mark.parametrize("mixing", [SPARSE, DENSEST])
 def test_shares_of_the_places_do_not_know_of_each_other(mixing):
-    """So threads may take them in any order."""
+    """So threads may take them in any order, or all at once."""
     sizes = np.random.default_rng(13).uniform(0.008, 0.06, (5, 128))
-    forward, alone = (Column(sizes, RING, rise=3.0, mixing=mixing, means=0.03, seed=13) for _ in range(2))
+    forward, alone, at_once = (Column(sizes, RING, rise=3.0, mixing=mixing, means=0.03, seed=13) for _ in range(3))
     forward.swap(1, shares=2)
     edges = Edges(alone.pairs, alone.rise, alone.mixing, 0 * alone.rise, np.arange(len(RING)))
     numbers, key = np.empty(64, np.uint64), next(alone.keys)
-    for first in (65, 1):
-        places = first, first + 64, numbers[:17], numbers[:17].view(np.uint16), np.empty(64, bool)
-        kernels.swap(alone.parcels, alone.slots, edges, alone.means, np.float32(sizes).max(), key, *places)
+    work = numbers[:17], numbers[:17].view(np.uint16), np.empty(64, bool)
+    for column, first, last in ((alone, 65, 129), (alone, 1, 65), (at_once, 1, 129)):
+        places = first, last, 64, *work
+        kernels.swap(column.parcels, column.slots, edges, column.means, np.float32(sizes).max(), key, *places)
     assert np.array_equal(forward.sizes, alone.sizes)
+    assert np.array_equal(forward.sizes, at_once.sizes)
     assert not np.array_equal(forward.sizes, np.float32(sizes))
 
 
