@@ -461,7 +461,7 @@ def _set_bounds(sizes, weakness, slot, bounds, block_bounds, known):
     cells = sizes.size - 2
     sizes[0], sizes[cells + 1] = sizes[cells], sizes[1]
     for p in range(bounds.size):
-        bounds[p] = _unshielded(sizes, weakness, slot, p, known) if 1 <= p <= cells else _NEVER
+        bounds[p] = _unshielded(sizes, weakness, slot, np.uint64(p), known) if 1 <= p <= cells else _NEVER
     for block in range(block_bounds.size):
         block_bounds[block] = _largest(bounds, block * BLOCK + 1) if block * BLOCK < cells else _NEVER
 
@@ -630,9 +630,9 @@ def _break(sizes, weakness, slot, bounds, places, found, known, ratios):
     sizes[0], sizes[cells + 1] = sizes[cells], sizes[1]
     bounds[0] = bounds[cells + 1] = _NEVER
     if found and places[0] == 1:
-        bounds[cells] = _unshielded(sizes, weakness, slot, cells, known)
+        bounds[cells] = _unshielded(sizes, weakness, slot, np.uint64(cells), known)
     if found and places[found - 1] == cells:
-        bounds[1] = _unshielded(sizes, weakness, slot, 1, known)
+        bounds[1] = _unshielded(sizes, weakness, slot, _1, known)
 
 
 @_inner
