@@ -222,7 +222,7 @@ class Resolution(Frozen):
     def level(self) -> str:
         """Return the level of these values with its measured error and cost, or "custom"."""
         for name, level in levels().items():
-            if level.values().items() <= dict(self).items():
+            if level.values().items() <= vars(self).items():
                 return f"{name}: {level.measured}, measured on the paper's scene"
         return "custom"
 
