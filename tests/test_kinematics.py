@@ -117,11 +117,9 @@ def test_strain_rates_are_those_of_the_velocity_field(values):
     assert not motion.volumetric_rate[above].any()  # exactly: the feed keeps its density
 
 
-@each
-def test_points_are_one_time_step_apart(values):
+def assert_one_time_step_apart(scene, points):
     """Time between neighbours by quadrature of the fall's inverse over height."""
-    scene = paper(values)
-    bed, motion, _ = moved(scene, sized(21, 9))
+    bed, motion, _ = moved(scene, points)
     nip = nip_of(scene, bed)
     for line, xi in enumerate(bed.xi):
         for upper, lower in zip(motion.y[line, :-1], motion.y[line, 1:], strict=True):
@@ -134,6 +132,17 @@ def test_points_are_one_time_step_apart(values):
                 points=kink,
             )[0]
             assert time == pytest.approx(motion.time_step, rel=1e-7)
+
+
+@each
+def test_points_are_one_time_step_apart(values):
+    assert_one_time_step_apart(paper(values), sized(21, 9))
+
+
+def test_points_are_one_time_step_apart_where_a_quartic_does_not_carry():
+    """The fall varies so much within a panel that Newton's method must take over."""
+    flow = {"flow.exponent": 5.0, "flow.entry_fraction": 1e-3}
+    assert_one_time_step_apart(paper(flow), sized(401, 101))
 
 
 @each

@@ -25,7 +25,6 @@ _NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2
 # of values at the nodes to the coefficients of u, u^2 .. of the integral from 0 to u of the quartic through them
 _INTEGRAL = np.linalg.inv(np.vander(_NODES, increasing=True)) / np.arange(1, 6)[:, None]
 _DENSEST = 0.99  # of the largest solid fraction, where a bed that stiffens as pores close is held
-
 _MET = 1e-7  # of the mean slowness of a panel, by which a quartic may miss that at its ends
 
 
