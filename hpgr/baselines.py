@@ -10,20 +10,33 @@ specific energy.
 
 SI in and out; size distributions are fractions passing on the sieves of a `PilotTest`, which rise. Classes run from
 coarse to fine: between the sieves, and below the finest.
+
+Examples
+--------
+>>> import hpgr
+>>> from hpgr.baselines import fit_hinde_kalala, fit_torres_casali
+>>> from hpgr.tables import read_pilot_tests
+>>> folder, scene = hpgr.presets.DATA, hpgr.presets.khd_pilot()
+>>> tests = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
+>>> round(fit_torres_casali(tests[:1], scene).predict(tests[0]).throughput * 3.6, 1)  # t/h
+32.9
+>>> round(fit_hinde_kalala(tests[:1], scene).predict(tests[0]).specific_energy / 3600, 2)  # kWh/t, 1.44 were measured
+1.44
 """
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy import optimize
 
+from hpgr.calibration import PARTS as PRODUCTS
+from hpgr.calibration import measured
 from hpgr.laws.flow import cake_nip_angle, densest_ratio
 from hpgr.scene import Scene
 from hpgr.tables import PilotTest
 
-PRODUCTS = ("centre", "edge", "total")
 _EVALUATIONS = 150  # per start, without those for derivatives; the pilot tests take 10 to 35
 _LOGARITHMIC = {"selection", "rate"}  # fitted by their logarithm
 
@@ -64,7 +77,7 @@ class TorresCasali(NamedTuple):
     selection: float  # S_1, kg J-1 (1 t/kWh is 1/3600 kg/J)
     slope: float  # zeta1
     curvature: float  # zeta2
-    edge_share: float  # fraction of the product that is called edge
+    edge_share: float = 0.2  # fraction of the product that is called edge; told by centre and edge alone
 
 
 class HindeKalala(NamedTuple):
@@ -78,8 +91,8 @@ class HindeKalala(NamedTuple):
     exponent: float
     bend: float  # 0..1
     coarse_exponent: float
-    edge_share: float  # fraction of the product that is called edge
-    edge_energy: float  # specific energy of the edge / mean specific energy
+    edge_share: float = 0.2  # fraction of the product that is called edge; this and the next told by centre and edge
+    edge_energy: float = 0.5  # specific energy of the edge / mean specific energy
 
 
 class TorresCasaliModel(NamedTuple):
@@ -150,15 +163,9 @@ class Fit(NamedTuple):
         return self.model.predict(self.parameters, test)
 
 
-class _Search(NamedTuple):
-    low: Any  # lowest and highest value that a fit may take
-    high: Any
-    starts: tuple  # the published porphyry first; the others around it
-    of_edges: dict[str, float]  # parameters that the total alone does not tell, and their usual values
-
-
+# lowest and highest value that a fit may take, and its starts: the published porphyry first, the others around it
 _SEARCHES = {
-    TorresCasali: _Search(
+    TorresCasali: (
         TorresCasali(1e-6, 0.01, 0.5, 1e-7, -2.0, -2.0, 0.01),
         TorresCasali(1.0, 5.0, 30.0, 1e-1, 5.0, 0.3, 0.6),
         (
@@ -167,9 +174,8 @@ _SEARCHES = {
             TorresCasali(0.70, 0.60, 5.0, 2.0 / 3600, 0.5, 0.0, 0.2),
             TorresCasali(0.10, 0.30, 1.5, 0.5 / 3600, -1.0, -0.3, 0.3),
         ),
-        {"edge_share": 0.2},
     ),
-    HindeKalala: _Search(
+    HindeKalala: (
         HindeKalala(1e-7, 0.01, 0.0, 0.1, 0.01, 0.01),
         HindeKalala(1e-1, 5.0, 1.0, 10.0, 0.6, 1.0),
         (
@@ -177,7 +183,6 @@ _SEARCHES = {
             HindeKalala(5.0 / 3600, 0.6, 0.9, 3.0, 0.15, 0.3),
             HindeKalala(0.5 / 3600, 0.8, 0.1, 1.5, 0.3, 0.8),
         ),
-        {"edge_share": 0.2, "edge_energy": 0.5},
     ),
 }
 
@@ -186,23 +191,8 @@ def fit_torres_casali(tests: Sequence[PilotTest], scene: Scene) -> Fit:
     """Fit the Torres & Casali model to the measured size distributions of `tests` by least squares.
 
     Rolls and densities are the scene's, or the first test's where it tells them; the cake's density is that of the
-    throughput through the measured opening. The force is the hydraulic pressure's where that was measured.
-
-    Raises
-    ------
-    ValueError
-        If there are no tests, or a test has no opening.
-
-    Examples
-    --------
-    >>> import hpgr
-    >>> from hpgr.baselines import fit_torres_casali
-    >>> from hpgr.tables import read_pilot_tests
-    >>> folder = hpgr.presets.DATA
-    >>> tests = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
-    >>> found = fit_torres_casali(tests[:1], hpgr.presets.khd_pilot())
-    >>> round(found.predict(tests[0]).throughput * 3.6, 1)  # t/h
-    32.9
+    throughput through the measured opening. The force is the hydraulic pressure's where that was measured. ValueError
+    if there are no tests, or a test has no opening.
     """
     _refuse_none(tests)
     opening = "gap" if any(math.isnan(test.cake_thickness) for test in tests) else "cake_thickness"
@@ -217,19 +207,13 @@ def fit_torres_casali(tests: Sequence[PilotTest], scene: Scene) -> Fit:
 
 
 def _machine_of(tests: Sequence[PilotTest], scene: Scene, opening: str) -> Machine:
-    rolls, bed, first = scene.rolls, scene.bed, tests[0]
-    diameter, width, solid = (
-        own if math.isnan(told) else told
-        for own, told in (
-            (rolls.diameter, first.diameter),
-            (rolls.width, first.width),
-            (bed.solid_density, first.solid_density),
-        )
-    )
+    told = tests[0].diameter, tests[0].width, tests[0].solid_density
+    own = scene.rolls.diameter, scene.rolls.width, scene.bed.solid_density
+    diameter, width, solid = np.where(np.isnan(told), own, told).tolist()
     cakes = [test.throughput / (getattr(test, opening) * width * test.surface_speed) for test in tests]
     known = [cake for cake in cakes if math.isfinite(cake)]
     cake = sum(known) / len(known) if known else 0.85 * solid
-    return Machine(diameter, width, solid, solid * bed.feed_solid_fraction, cake)
+    return Machine(diameter, width, solid, solid * scene.bed.feed_solid_fraction, cake)
 
 
 def fit_hinde_kalala(tests: Sequence[PilotTest], scene: Scene) -> Fit:
@@ -240,30 +224,14 @@ def fit_hinde_kalala(tests: Sequence[PilotTest], scene: Scene) -> Fit:
     here. Two things are additions of this package. The edge, a share of the product, sees `edge_energy` times the mean
     specific energy, the centre what is left. The specific energy is energy_per_force * specific pressing force, its
     constant fitted to the specific energies of `tests` by least squares, also where one was measured. Nothing is taken
-    of the `scene`.
-
-    Raises
-    ------
-    ValueError
-        If there are no tests, or none with a specific energy.
-
-    Examples
-    --------
-    >>> import hpgr
-    >>> from hpgr.baselines import fit_hinde_kalala
-    >>> from hpgr.tables import read_pilot_tests
-    >>> folder = hpgr.presets.DATA
-    >>> tests = read_pilot_tests(folder / "khd_porphyry_psd.csv", folder / "khd_porphyry_operations.csv")
-    >>> found = fit_hinde_kalala(tests[:1], hpgr.presets.khd_pilot())
-    >>> round(found.model.energy_per_force * 2.5e6 / 3600, 2)  # kWh/t at 2.5 N/mm2, as measured
-    1.44
+    of the `scene`. ValueError if there are no tests, or none with a specific energy.
     """
     _refuse_none(tests)
-    measured = [(test.specific_pressing_force, _specific_energy(test)) for test in tests]
-    measured = [(force, energy) for force, energy in measured if not math.isnan(energy)]
-    if not measured:
+    pairs = [(test.specific_pressing_force, measured(test, "specific_energy").item()) for test in tests]
+    pairs = [(force, energy) for force, energy in pairs if not math.isnan(energy)]
+    if not pairs:
         raise ValueError("specific_energy: got no measured one; one test must have it, or power and throughput; add it")
-    force, energy = np.array(measured).T
+    force, energy = np.array(pairs).T
     model = HindeKalalaModel(float(max(test.sizes[-1] for test in tests)), float(force @ energy / (force @ force)))
     found = _least_squares(model, tests, HindeKalala)
     ore = found.parameters
@@ -281,20 +249,13 @@ def _refuse_none(tests: Sequence[PilotTest]) -> None:
         raise ValueError("tests: got none; a fit needs at least one; give those to calibrate on")
 
 
-def _specific_energy(test: PilotTest) -> float:
-    return test.power / test.throughput if math.isnan(test.specific_energy) else test.specific_energy
-
-
 # ---- equations of Torres & Casali
 
 
 def nip_angle(machine: Machine, opening: float) -> float:
     """Return the angle (rad) at which the feed's bulk density begins to be compacted to the cake.
 
-    Raises
-    ------
-    ValueError
-        If no angle does that, because the opening is too wide for the rolls.
+    ValueError if none does that, because the opening is too wide for the rolls.
     """
     dense = machine.cake_density / machine.bulk_density
     if dense > densest_ratio(opening, machine.diameter):
@@ -397,30 +358,28 @@ def decay(parameters: HindeKalala, sizes: np.ndarray, reference_size: float) -> 
 
 def _least_squares(model, tests, kind) -> Fit:
     """Return the best fit over all starts; what only centre and edge tell keeps its usual value without them."""
-    search = _SEARCHES[kind]
+    low, high, starts = _SEARCHES[kind]
     apart = any(np.isfinite(test.centre).any() or np.isfinite(test.edge).any() for test in tests)
-    fixed = {} if apart else search.of_edges
-    free = [name for name in kind._fields if name not in fixed]
+    free = [name for name in kind._fields if apart or name not in kind._field_defaults]
 
     def parameters(vector):
         pairs = zip(free, vector, strict=True)
-        return kind(**{name: math.exp(x) if name in _LOGARITHMIC else float(x) for name, x in pairs}, **fixed)
+        return kind(**{name: math.exp(x) if name in _LOGARITHMIC else float(x) for name, x in pairs})
 
     def place_of(values):
         return [math.log(getattr(values, n)) if n in _LOGARITHMIC else getattr(values, n) for n in free]
 
     def residuals(vector):
+        """Return model minus measurement in percent passing wherever there is one."""
         found = parameters(vector)
-        return np.concatenate([_differences(model.predict(found, test), test) for test in tests])
+        pairs = [(model.predict(found, test), test) for test in tests]
+        off = np.hstack(
+            [100 * (getattr(said, name) - getattr(test, name)) for said, test in pairs for name in PRODUCTS]
+        )
+        return off[~np.isnan(off)]
 
-    ends = (place_of(search.low), place_of(search.high))
+    ends = (place_of(low), place_of(high))
     options = {"bounds": ends, "x_scale": "jac", "xtol": 1e-10, "ftol": 1e-10, "max_nfev": _EVALUATIONS}
-    fits = [optimize.least_squares(residuals, place_of(start), **options) for start in search.starts]
+    fits = [optimize.least_squares(residuals, place_of(start), **options) for start in starts]
     best = min(fits, key=lambda fit: fit.cost)
     return Fit(model, parameters(best.x), float(np.sqrt(np.mean(best.fun**2))), tuple(free))
-
-
-def _differences(prediction: Prediction, test: PilotTest) -> np.ndarray:
-    """Return model minus measurement in percent passing wherever there is one."""
-    found = np.concatenate([100 * (getattr(prediction, name) - getattr(test, name)) for name in PRODUCTS])
-    return found[~np.isnan(found)]
