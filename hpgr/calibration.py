@@ -150,13 +150,14 @@ class Calibration(NamedTuple):
         found = self.problem.predict(self.place, test)
         if not intervals:
             return found
-        slopes = [self.problem.slope(self.place, k, test, found) for k in range(self.place.size)]
+        moved = [self.problem.moved(self.place, k) for k in range(self.place.size)]
+        aside = [(self.problem.predict(place, test), step) for place, step in moved]
         lower, upper = {}, {}
         for name in (*PARTS, *FIGURES, "gap"):
             value = getattr(found, name)
             if value is None:
                 continue
-            change = np.array([one[name] for one in slopes])
+            change = np.array([(getattr(said, name) - value) / step for said, step in aside])
             variance = np.einsum("i...,ij,j...->...", change, self.covariance, change)
             off = self.discrepancy.get(name, 0.0) * _scale(value, name)
             reach, most = _LEVEL * np.sqrt(variance + off**2), 1.0 if name in PARTS else math.inf
@@ -166,8 +167,8 @@ class Calibration(NamedTuple):
     def sample(self, n: int, seed: int) -> list[Scene]:
         """Return `n` scenes that the tests leave possible: parameters drawn with their covariance."""
         drawn = np.random.default_rng(seed).multivariate_normal(self.place, self.covariance, n)
-        low, high = self.problem.bounds()
-        return [self.scene.with_values(self.problem.values(place, 0)) for place in np.clip(drawn, low, high)]
+        drawn = np.clip(drawn, self.problem.low, self.problem.high)
+        return [self.scene.with_values(self.problem.values(place, 0)) for place in drawn]
 
     def __str__(self) -> str:
         lines = [f"calibrated on {', '.join(self.residuals)}"]
@@ -248,11 +249,13 @@ def fit_tests(
     names = _known_names(scene, fit)
     problem = _Problem(scene.with_values({"resolution.record": "product"}), list(tests), names, feed)
     start = problem.start()
-    place, free = start if near is None else problem.from_estimates(near, start), list(range(start.size))
+    known = {} if near is None else dict(zip(near.problem.labels, near.place, strict=True))
+    place = np.array([known.get(label, number) for label, number in zip(problem.labels, start, strict=True)])
+    free = list(range(start.size))
     while True:  # one after another is left at its start, until the tests tell the rest
         place = problem.minimise(place, start, free)
         slopes = problem.slopes(place)
-        doubt = np.sqrt(np.diag(problem.covariance(place, slopes, free))) / problem.spreads()[free]
+        doubt = np.sqrt(np.diag(problem.covariance(place, slopes, free))) / problem.spreads[free]
         if not free or doubt.max() < _TOLD:
             break
         place[free[int(doubt.argmax())]] = start[free[int(doubt.argmax())]]
@@ -324,16 +327,11 @@ class _Problem:
         self.columns = [
             (name, group) for name in names for group in (sorted(set(self.groups)) if name in _MACHINES else [0])
         ]
-
-    def labels(self) -> list[str]:
-        return [name if group == 0 else f"{name} of {self.tests[group].name}" for name, group in self.columns]
-
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        self.labels = [name if group == 0 else f"{name} of {tests[group].name}" for name, group in self.columns]
         fitted = [PARAMETERS[name] for name, _ in self.columns]
-        return np.array([one.scaled(one.low) for one in fitted]), np.array([one.scaled(one.high) for one in fitted])
-
-    def spreads(self) -> np.ndarray:
-        return np.array([PARAMETERS[name].spread for name, _ in self.columns])
+        self.low = np.array([one.scaled(one.low) for one in fitted])
+        self.high = np.array([one.scaled(one.high) for one in fitted])
+        self.spreads = np.array([one.spread for one in fitted])
 
     def values(self, place: np.ndarray, group: int) -> dict[str, Any]:
         """Return the scene fields of a group of tests, followers included."""
@@ -354,11 +352,6 @@ class _Problem:
             [PARAMETERS[name].scaled(_field(started[group], PARAMETERS[name].field)) for name, group in self.columns]
         )
 
-    def from_estimates(self, near: Calibration, start: np.ndarray) -> np.ndarray:
-        """Return the place that has what another calibration has found."""
-        known = dict(zip(near.problem.labels(), near.place, strict=True))
-        return np.array([known.get(label, number) for label, number in zip(self.labels(), start, strict=True)])
-
     def predict(self, place: np.ndarray, test: PilotTest) -> Prediction:
         """Return what the model says of a test, which may be none of those fitted."""
         group = next((k for k in self.groups if _one_machine(test, self.tests[k])), 0)
@@ -370,31 +363,23 @@ class _Problem:
             self._found[key] = _predict(_at_test(self.scene, test, self.feed).with_values(values), self._beds)
         return self._found[key]
 
-    def slope(self, place: np.ndarray, k: int, test: PilotTest, at: Prediction) -> dict[str, np.ndarray]:
-        """Return the derivatives of a prediction with number `k`, by a difference that stays within the bounds."""
-        moved = self._moved(place, k)
-        said, step = self.predict(moved, test), moved[k] - place[k]
-        names = [name for name in (*PARTS, *FIGURES, "gap") if getattr(at, name) is not None]
-        return {name: (getattr(said, name) - getattr(at, name)) / step for name in names}
-
-    def _moved(self, place: np.ndarray, k: int) -> np.ndarray:
-        """Return the place with number `k` a step further, within its bounds."""
-        moved, step = place.copy(), _STEP * PARAMETERS[self.columns[k][0]].spread
-        moved[k] += -step if place[k] + step > self.bounds()[1][k] else step
-        return moved
+    def moved(self, place: np.ndarray, k: int) -> tuple[np.ndarray, float]:
+        """Return the place with number `k` a step further, within its bounds, and the step."""
+        moved, step = place.copy(), _STEP * self.spreads[k]
+        moved[k] += -step if place[k] + step > self.high[k] else step
+        return moved, moved[k] - place[k]
 
     def residuals(self, place: np.ndarray) -> np.ndarray:
         """Return the weighted residuals of all tests, in units of a typical error."""
-        return np.concatenate([self._of_test(place, test) for test in self.tests])
-
-    def _of_test(self, place: np.ndarray, test: PilotTest) -> np.ndarray:
-        try:
-            off = _residuals(self.predict(place, test), test)
-        except ValueError:  # no gap carries the force
-            off = {name: np.full(len(sizes), _LOST) for name, sizes in self._compared(test)}
-        return np.concatenate(
-            [_WEIGHTS[name] / _ERROR * off[name] for name, _ in self._compared(test)] or [np.empty(0)]
-        )
+        found = [np.empty(0)]
+        for test in self.tests:
+            compared = self._compared(test)
+            try:
+                off = _residuals(self.predict(place, test), test)
+            except ValueError:  # no gap carries the force
+                off = {name: np.full(len(sizes), _LOST) for name, sizes in compared}
+            found += [_WEIGHTS[name] / _ERROR * off[name] for name, _ in compared]
+        return np.concatenate(found)
 
     def _compared(self, test: PilotTest) -> list[tuple[str, np.ndarray]]:
         """Return what a test and the scene have both, and the sizes at which it was measured, 1 m of a figure."""
@@ -406,8 +391,8 @@ class _Problem:
 
     def slopes(self, place: np.ndarray) -> np.ndarray:
         """Return the derivatives (residual, number) by differences that stay within the bounds."""
-        here, moved = self.residuals(place), [self._moved(place, k) for k in range(place.size)]
-        return np.array([(self.residuals(one) - here) / (one[k] - place[k]) for k, one in enumerate(moved)]).T
+        here, moved = self.residuals(place), [self.moved(place, k) for k in range(place.size)]
+        return np.array([(self.residuals(one) - here) / step for one, step in moved]).T
 
     def minimise(self, place: np.ndarray, start: np.ndarray, free: list[int]) -> np.ndarray:
         """Return the place of the least squares over the free numbers, each drawn to its start by its spread."""
@@ -415,8 +400,7 @@ class _Problem:
 
         if not free:
             return place
-        low, high = (end[free] for end in self.bounds())
-        spreads = self.spreads()[free]
+        low, high, spreads = self.low[free], self.high[free], self.spreads[free]
 
         def at(part: np.ndarray) -> np.ndarray:
             whole = place.copy()
@@ -437,7 +421,7 @@ class _Problem:
 
     def covariance(self, place: np.ndarray, slopes: np.ndarray, free: list[int]) -> np.ndarray:
         """Return the covariance of the free numbers: the residuals of a curve are correlated, and scatter as found."""
-        slopes, before, off = slopes[:, free], np.diag(self.spreads()[free] ** -2.0), self.residuals(place)
+        slopes, before, off = slopes[:, free], np.diag(self.spreads[free] ** -2.0), self.residuals(place)
         variance = off @ off / max(off.size - len(free), 1)
         inverse = np.linalg.inv(slopes.T @ slopes + before)
         return inverse @ (variance * slopes.T @ self._correlation() @ slopes + before) @ inverse
@@ -452,7 +436,7 @@ class _Problem:
 
 
 def _calibration(problem: _Problem, place: np.ndarray, slopes: np.ndarray, free: list[int]) -> Calibration:
-    labels, (low, high), every = problem.labels(), problem.bounds(), list(range(place.size))
+    labels, low, high, every = problem.labels, problem.low, problem.high, list(range(place.size))
     covariance = problem.covariance(place, slopes, every)
     estimates = {}
     for k, (name, _) in enumerate(problem.columns):
@@ -520,14 +504,9 @@ def _at_test(scene: Scene, test: PilotTest, feed: Feed | None) -> Scene:
     known, rolls = ~np.isnan(test.feed), scene.rolls
     diameter = rolls.diameter if math.isnan(test.diameter) else test.diameter
     speed = test.surface_speed / (diameter / 2)
-    table = [
-        (size, 100 * part) for size, part in zip(test.sizes[known].tolist(), test.feed[known].tolist(), strict=True)
-    ]
-    told = {
-        "rolls.width": test.width,
-        "bed.solid_density": test.solid_density,
-        "rolls.idle_torque": test.idle_power / speed,
-    }
+    table = list(zip(test.sizes[known].tolist(), (100 * test.feed[known]).tolist(), strict=True))
+    own = {"rolls.width": test.width, "bed.solid_density": test.solid_density}
+    told = own | {"rolls.idle_torque": test.idle_power / speed}
     return scene.with_values(
         {name: value for name, value in told.items() if not math.isnan(value)}
         | {
@@ -563,9 +542,9 @@ def _residuals(said: Prediction, test: PilotTest) -> dict[str, np.ndarray]:
 
 def _started(scene: Scene, names: Sequence[str], test: PilotTest, feed: Feed | None) -> Scene:
     """Return the scene with starting values that a test tells by itself: moduli that carry its force, and strength."""
-    for name, usual in (("k", 1.0), ("n", 1.0)):
+    for name in ("k", "n"):
         if name in names and math.isinf(_field(scene, PARAMETERS[name].field)):
-            scene = scene.with_values({PARAMETERS[name].field: usual})
+            scene = scene.with_values({PARAMETERS[name].field: 1.0})
     here = _at_test(scene, test, feed)
     rolls, bed = here.rolls, here.bed
     through = test.throughput / (_SOLID * bed.solid_density * rolls.width * test.surface_speed)

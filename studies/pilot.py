@@ -5,7 +5,7 @@ beside each other by leaving out one and two tests of all.
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -94,13 +94,10 @@ _MACHINE, _ORE = ("alpha", "K"), ("sigma_m", "w", "gamma")
 _NO_SLIP, _NO_RECOVERY = {"flow.slip": 0.0, "flow.nip_angle": 0.16}, {"elasticity.recovery_modulus": None}
 _POWER_LAW = {"elasticity.densification": 0.0, "elasticity.exponent": 0.5}
 _PARABOLA, _THRESHOLD = {"roll_width": {"kind": "parabola"}}, {"strength.scatter": math.inf}
+_PAPER = _NO_SLIP | _NO_RECOVERY | _POWER_LAW | _PARABOLA | _THRESHOLD
 COMBINATIONS = (
-    Laws("paper's laws", _NO_SLIP | _NO_RECOVERY | _POWER_LAW | _PARABOLA | _THRESHOLD, (*_ORE, "kappa", *_MACHINE)),
-    Laws(
-        "the same, idle torque fitted",
-        _NO_SLIP | _NO_RECOVERY | _POWER_LAW | _PARABOLA | _THRESHOLD,
-        (*_ORE, "kappa", *_MACHINE, "T_0"),
-    ),
+    Laws("paper's laws", _PAPER, (*_ORE, "kappa", *_MACHINE)),
+    Laws("the same, idle torque fitted", _PAPER, (*_ORE, "kappa", *_MACHINE, "T_0")),
     Laws("bed: slip", _NO_RECOVERY | _POWER_LAW | _PARABOLA | _THRESHOLD, (*_ORE, "kappa", *_MACHINE)),
     Laws("bed: slip, densification", _NO_RECOVERY | _PARABOLA | _THRESHOLD, (*_ORE, "kappa", *_MACHINE)),
     Laws("bed: slip, densification, recovery", _PARABOLA | _THRESHOLD, (*_ORE, "kappa", *_MACHINE)),
@@ -174,6 +171,7 @@ def _models(
 ) -> tuple[list[Model], Scene, dict[str, np.ndarray]]:
     """Return the fitted models, ours first, its scene, with the sieves of `scene`, and samples of its fields."""
     from hpgr import calibration
+    from hpgr.baselines import MODELS
 
     print(f"fitting to {', '.join(test.name for test in known)} (about a minute)", flush=True)
     found = calibration.fit_tests(scene, known, fit)
@@ -183,24 +181,16 @@ def _models(
     drawn = [values_of(one) for one in found.sample(_SAMPLES, seed=0)]
     samples = {name: np.array([one[name] for one in drawn]) for name in fields}
     models = [Model("hpgr", found.predict, str(found))]
-    if baselines:
-        models += _baselines(scene, known)
-    remark = f"fitted to {', '.join(test.name for test in known)}"
-    fitted_scene = found.scene.with_values({"resolution.sieves": scene.resolution.sieves, "remark": remark})
-    return models, fitted_scene, samples
-
-
-def _baselines(scene: Scene, known: Sequence[Any]) -> Iterable[Model]:
-    """Yield the population balance models that the tests allow; one that cannot be fitted says why."""
-    from hpgr import baselines
-
-    for name, fit in baselines.MODELS.items():
+    for name, fit_model in (MODELS if baselines else {}).items():
         try:
-            found = fit(known, scene)
+            other = fit_model(known, scene)
         except ValueError as error:
             print(f"{name} left out: {error}")
             continue
-        yield Model(name, found.predict, f"fitted to {found.rmse:.2f} percent passing")
+        models.append(Model(name, other.predict, f"fitted to {other.rmse:.2f} percent passing"))
+    remark = f"fitted to {', '.join(test.name for test in known)}"
+    fitted_scene = found.scene.with_values({"resolution.sieves": scene.resolution.sieves, "remark": remark})
+    return models, fitted_scene, samples
 
 
 # ---- comparing
@@ -225,8 +215,7 @@ def comparison(scene: Scene, tests: Sequence[Any], baselines: bool) -> "xr.Datas
     from hpgr.baselines import MODELS
     from hpgr.results import schema
 
-    fits = [_Refit(scene, laws) for laws in COMBINATIONS]
-    named: list[tuple[str, Callable[[list[Any]], Any]]] = [(one.laws.name, one) for one in fits]
+    named = [(laws.name, _refit(scene, laws)) for laws in COMBINATIONS]
     named += [(name, lambda known, fit=fit: fit(known, scene)) for name, fit in (MODELS if baselines else {}).items()]
     values = np.full((1 + len(named), 3, len(_ERRORS)), np.nan)
     constants = np.zeros(len(values), int)
@@ -258,20 +247,20 @@ def comparison(scene: Scene, tests: Sequence[Any], baselines: bool) -> "xr.Datas
     return schema.to_dataset(data, attrs, table)
 
 
-class _Refit:
-    """Fits of one combination of laws, each from the first that was made."""
+def _refit(scene: Scene, laws: Laws) -> Callable[[list[Any]], Any]:
+    """Return what fits a combination of laws to tests, each time from the first fit that was made."""
+    from hpgr import calibration
 
-    def __init__(self, scene: Scene, laws: Laws):
-        share = {"edge_share": scene.roll_width.edge_share, "slices": scene.roll_width.slices}
-        width = {"roll_width": laws.values["roll_width"] | share} if "roll_width" in laws.values else {}
-        self.scene, self.laws, self.first = scene.with_values(laws.values | width), laws, None
+    share = {"edge_share": scene.roll_width.edge_share, "slices": scene.roll_width.slices}
+    width = {"roll_width": laws.values["roll_width"] | share} if "roll_width" in laws.values else {}
+    scene, first = scene.with_values(laws.values | width), []
 
-    def __call__(self, tests: list[Any]) -> Any:
-        from hpgr.calibration import fit_tests
-
-        found = fit_tests(self.scene, tests, self.laws.fit, near=self.first)
-        self.first = self.first or found
+    def fit(tests: list[Any]) -> Any:
+        found = calibration.fit_tests(scene, tests, laws.fit, near=next(iter(first), None))
+        first[:] = first or [found]
         return found
+
+    return fit
 
 
 def _left_out(tests: Sequence[Any], fit: Callable[[list[Any]], Any], count: int) -> tuple[list[tuple[Any, Any]], int]:
@@ -425,26 +414,16 @@ def _own(samples: dict[str, np.ndarray]) -> dict[str, Any]:
         for name, one in figures.items()
         for side in ("lower", "upper")
     }
-    return (
-        figures
-        | ends
-        | {
-            "blind": Variable(("test",), "1", "whether the test was left out of the fit", dtype=np.int8),
-            "failure": Variable(dims, "", "why a model predicts nothing of a test", dtype=object),
-            "source": Variable(("source",), "", "measurement or model", dtype=object),
-            "test": Variable(("test",), "", "pilot test", dtype=object),
-            "part": Variable(("part",), "", "part of the roll width", dtype=object),
-            **{
-                name: Variable(
-                    ("sample",),
-                    field_info(name).unit,
-                    f"{field_info(name).symbol}, drawn with its covariance",
-                    dtype=np.float64,
-                )
-                for name in samples
-            },
-        }
-    )
+    words = {"source": "measurement or model", "test": "pilot test", "part": "part of the roll width"}
+    told = {
+        "blind": Variable(("test",), "1", "whether the test was left out of the fit", dtype=np.int8),
+        "failure": Variable(dims, "", "why a model predicts nothing of a test", dtype=object),
+    }
+    told |= {name: Variable((name,), "", each, dtype=object) for name, each in words.items()}
+    for name, info in zip(samples, map(field_info, samples), strict=True):
+        drawn = f"{info.symbol}, drawn with its covariance"
+        told[name] = Variable(("sample",), info.unit, drawn, dtype=np.float64)
+    return figures | ends | told
 
 
 def _predicted(model: Model, test: Any) -> dict[str, Any]:
@@ -498,9 +477,8 @@ def blind_summary(result: "xr.Dataset") -> list[str]:
     for name in result["source"].values[1:]:
         one = blind.sel(source=name)
         total = one["rmse"].sel(part="total")
-        worst = [float(abs(100 * (one[key] / measured[key] - 1)).max()) for key in ("throughput", "power")]
-        named = zip(("throughput", "power"), worst, strict=True)
-        errors = ", ".join(f"{key} within {_figure(value, '.1f')} %" for key, value in named)
+        worst = {key: float(abs(100 * (one[key] / measured[key] - 1)).max()) for key in ("throughput", "power")}
+        errors = ", ".join(f"{key} within {_figure(value, '.1f')} %" for key, value in worst.items())
         lines.append(f"  {name}: median {float(total.median()):.2f}, largest {float(total.max()):.2f}; {errors}")
     return lines
 

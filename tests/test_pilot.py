@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 from support import COMPILED
 
-from hpgr import presets, tables
+from hpgr import calibration, presets, tables
 from hpgr.calibration import predict
 from studies import pilot
 from studies.pilot import main
@@ -206,11 +206,11 @@ def test_laws_are_compared_by_leaving_out(written, capsys, monkeypatch):
 
 
 def test_laws_under_which_no_gap_carries_a_test_are_told_and_have_no_errors(capsys, monkeypatch):
-    def refuse(*_):
+    def refuse(*_, **__):
         raise ValueError("rolls.specific_pressing_force: got 3.5 MPa; no gap")
 
     monkeypatch.setattr(pilot, "COMBINATIONS", [pilot.Laws("weak", {}, ("K",))])
-    monkeypatch.setattr(pilot._Refit, "__call__", refuse)
+    monkeypatch.setattr(calibration, "fit_tests", refuse)
     tests = tables.read_pilot_tests(PRODUCT, OPERATIONS)
     scene = presets.khd_pilot().with_values({"roll_width": {"kind": "parabola"}, "resolution.record": "product"})
     result = pilot.comparison(scene, tests, baselines=False)
