@@ -17,7 +17,7 @@ import numpy as np
 
 from hpgr.bed import machine
 from hpgr.bed.loaded import Beds
-from hpgr.fields import show
+from hpgr.fields import names_of, path_of, show
 from hpgr.grains import solve
 from hpgr.laws.feed import Feed, TableFeed
 from hpgr.laws.flow import NipFlow, cake_nip_angle, densest_ratio
@@ -228,8 +228,9 @@ def calibrate(
     ['sigma_m', 'gamma']
     """
     check_scene(scene)
-    known = {test.name: test for test in read_pilot_tests(product, operations)}
-    wanted = list(known) if tests is None else list(tests)
+    tables = path_of("product", product), path_of("operations", operations)
+    known = {test.name: test for test in read_pilot_tests(*tables)}
+    wanted = list(known) if tests is None else names_of("tests", tests, next(iter(known)))
     unknown = [repr(name) for name in wanted if name not in known]
     if unknown or not wanted:
         told = ", ".join(unknown) or "none"
@@ -514,7 +515,7 @@ def _at_test(scene: Scene, test: PilotTest, feed: Feed | None) -> Scene:
             "rolls.entry_gap": rolls.entry_gap * diameter / rolls.diameter,
             "rolls.speed": speed,
             "rolls.specific_pressing_force": test.specific_pressing_force,
-            "feed": feed or TableFeed(table=table),
+            "feed": TableFeed(table=table) if feed is None else feed,
             "resolution.sieves": tuple(test.sizes.tolist()),
             "flow": scene.flow.held(rolls.gap, rolls.diameter, scene.bed.feed_solid_fraction),
         }
@@ -597,7 +598,7 @@ def _known_names(scene: Scene, fit: Sequence[str] | None) -> list[str]:
     }
     if fit is None:
         return [name for name in FIT if not lacking.get(name)]
-    names = list(dict.fromkeys(fit))
+    names = list(dict.fromkeys(names_of("fit", fit, "sigma_m")))
     unknown = [name for name in names if name not in PARAMETERS]
     if unknown or not names:
         told = ", ".join(unknown) or "nothing"

@@ -9,8 +9,9 @@ import math
 import numbers
 import operator
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache, partial
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self, get_args
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, create_model, model_validator
@@ -107,20 +108,46 @@ _RANGES = {  # of numbers that functions take beside a scene: least, most, unit 
 
 def check_number(name: str, value: Any) -> None:
     """Raise ValueError if an argument of a public function is not a number in its range."""
-    least, most, unit, example = _RANGES[name]
+    least, most, unit, example = _RANGES[name.strip("-").replace("-", "_")]
     number = isinstance(value, numbers.Real) and not isinstance(value, bool)
     if not number or not float(least) <= value <= float(most):
-        raise ValueError(f"{name}: got {value!r}; must be within {least} to {most}{unit}; such as {name}={example}")
+        raise ValueError(f"{name}: got {value!r:.80}; must be within {least} to {most}{unit}; such as {name}={example}")
 
 
-def check_seed(name: str, value: int) -> None:
+def check_count(name: str, value: Any) -> None:
+    """Raise ValueError if an argument of a public function is not a whole number from 1 to a million."""
+    _check_whole(name, value, 1, "1,000,000", 10**6)
+
+
+def check_seed(name: str, value: Any) -> None:
     """Raise ValueError if a seed or replicate number is not a whole number that a result file can hold."""
+    _check_whole(name, value, 0, "2**63 - 1", 2**63 - 1)
+
+
+def _check_whole(name: str, value: Any, least: int, shown: str, most: int) -> None:
     try:
         whole = -1 if isinstance(value, bool) else operator.index(value)
     except TypeError:
         whole = -1
-    if not 0 <= whole < 2**63:
-        raise ValueError(f"{name}: got {value!r}; must be a whole number from 0 to 2**63 - 1; such as {name}=0")
+    if not least <= whole <= most:
+        raise ValueError(
+            f"{name}: got {value!r:.80}; must be a whole number from {least} to {shown}; such as {name}={least}"
+        )
+
+
+def path_of(name: str, value: Any) -> Path:
+    """Return the path that an argument of a public function is; ValueError if it is none."""
+    if not isinstance(value, str | Path) or "\0" in str(value):
+        raise ValueError(f"{name}: got {value!r:.80}; must be a path; such as {name}='outputs/mine'")
+    return Path(value)
+
+
+def names_of(name: str, value: Any, example: str) -> list[str]:
+    """Return the names that an argument of a public function lists; ValueError if it lists none, or is one itself."""
+    found = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else [None]
+    if not all(isinstance(one, str) for one in found):
+        raise ValueError(f"{name}: got {value!r:.80}; must be a list of names; such as {name}=[{example!r}]")
+    return found
 
 
 def _number(value: Any, unit: str) -> float:
@@ -271,7 +298,7 @@ def _meant(parts: list[type[Frozen]], data: Any) -> type[Frozen]:
     if isinstance(data, Frozen):
         return type(data)
     named = data.get("kind") if isinstance(data, Mapping) else None
-    return next((part for part in parts if named in kinds_of(part)), parts[0])
+    return next((part for part in parts if isinstance(named, str) and named in kinds_of(part)), parts[0])
 
 
 def kinds_of(law: type[Frozen]) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 import tomllib
 
-from hpgr.scene import DATA, Scene, preset_names
+from hpgr.scene import DATA, Scene, check_scene, preset_names
 
 NAMES = preset_names()
 
@@ -61,6 +61,7 @@ def fitting_alike(scene: Scene) -> dict[str, Scene]:
     >>> hpgr.presets.fitting_alike(hpgr.presets.paper())
     {}
     """
+    check_scene(scene)
     fitted = khd_pilot()
     if (scene.strength, scene.fragments) != (fitted.strength, fitted.fragments):
         return {}

@@ -29,6 +29,7 @@ from hpgr.fields import (
     kinds_of,
     parse,
     parts_of,
+    path_of,
     quantity,
     show,
     valid_alone,
@@ -298,7 +299,7 @@ class Scene(Frozen):
         OSError
             If the file cannot be read.
         ValueError
-            If it is neither TOML nor JSON, or not a scene (pydantic.ValidationError, every fault listed).
+            If it is no path, or neither TOML nor JSON, or not a scene (pydantic.ValidationError, every fault listed).
 
         Examples
         --------
@@ -311,7 +312,7 @@ class Scene(Frozen):
         ...     hpgr.Scene.from_file(path).rolls.gap
         0.05
         """
-        path = Path(path)
+        path = path_of("path", path)
         text, kind = tables.text_of(path), "JSON" if path.suffix == ".json" else "TOML"
         try:
             data = _shallow(json.loads(text) if kind == "JSON" else tomllib.loads(_without_long_keys(text)))
@@ -338,7 +339,7 @@ class Scene(Frozen):
         ValueError
             If there is no such preset.
         """
-        if name not in preset_names():
+        if not isinstance(name, str) or name not in preset_names():
             known = ", ".join(map(repr, preset_names()))
             raise ValueError(f"base: got {name!r}; must be one of {known}; choose one of these, or leave it out")
         return cls.from_file(DATA / "presets" / f"{name}.toml")
@@ -358,21 +359,24 @@ class Scene(Frozen):
 
         Raises
         ------
-        pydantic.ValidationError
-            If a name is unknown, or the scene is impossible with these values.
+        ValueError
+            If values have no names, a name is unknown, or the scene is impossible with these values
+            (pydantic.ValidationError, every fault listed).
         """
+        if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
+            raise ValueError(f"values: got {values!r:.80}; must be values by name; such as {{'rolls.gap': '40 mm'}}")
         data: dict[str, Any] = dict(self)  # parts left alone stay models, which are not validated again
         data |= {name: whole for name, whole in values.items() if "." not in name}
         level = _level(data["resolution"])
         if level is not None:  # what is kept of the results stays
             data["resolution"] = dict(self.resolution) | level.values()
         for name in {name.partition(".")[0] for name in values if "." in name}:
-            part = data.get(name) or {}
+            part = {} if data.get(name) is None else data[name]
             if not isinstance(part, BaseModel | Mapping):
                 continue  # refused below
             data[name] = dict(part)
             kind = values.get(f"{name}.kind")
-            law = kind and next((law for law in _parts(name) if kind in kinds_of(law)), None)
+            law = next((law for law in _parts(name) if isinstance(kind, str) and kind in kinds_of(law)), None)
             if law:
                 data[name] = {key: value for key, value in data[name].items() if key in law.model_fields}
         for name, value in values.items():
@@ -548,6 +552,6 @@ def _find_field(name: str) -> tuple[type[Frozen], Any]:
             for key, field in part.model_fields.items():
                 fields.setdefault(f"{section}.{key}", (part, field))
     if name not in fields:
-        close = difflib.get_close_matches(name, fields, n=3, cutoff=0.3) or ["rolls.gap"]
+        close = difflib.get_close_matches(str(name), fields, n=3, cutoff=0.3) or ["rolls.gap"]
         raise ValueError(f"a scene has no field {name!r}; did you mean {' or '.join(map(repr, close))}?")
     return fields[name]

@@ -5,6 +5,7 @@ import math
 import pkgutil
 import re
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from hpgr.grains import closed_form, kernels
 from hpgr.results import flags as limits
 from hpgr.results import schema
 from hpgr.run import load, run_scene, run_together
+from studies import open_cases
 from studies.sweep import sweep
 
 INF = math.inf
@@ -456,6 +458,7 @@ def test_substeps_refine_the_stress_and_keep_the_points(values):
 
 # --- what is no argument ----------------------------------------------------------------------------------------
 
+PRODUCT, OPERATIONS = (hpgr.presets.DATA / f"khd_porphyry_{name}.csv" for name in ("psd", "operations"))
 NO_ARGUMENTS = {
     "tolerance: got '1%'; must be within 1e-4 to 0.5; such as tolerance=0.01": lambda s, d: simulate(s, tolerance="1%"),
     "tolerance: got True; must be": lambda s, d: simulate(s, tolerance=True),
@@ -472,6 +475,38 @@ NO_ARGUMENTS = {
     "percent: got '80'; must be within 0 to 100; such as percent=80": lambda s, d: hpgr.percentile_size(d, "80"),
     "percent: got None; must be": lambda s, d: hpgr.reduction_ratio(d, None),
     "point: got 1.5; must be a whole number": lambda s, d: hpgr.passing(d, ["1 mm"], point=1.5),
+    "point: got True; must be a whole number": lambda s, d: hpgr.percentile_size(d, 80, True),
+    "sieves: got [1000": lambda s, d: hpgr.passing(d, [10**400]),
+    "values: got 3; must be values by name; such as {'rolls.gap'": lambda s, d: s.with_values(3),
+    "values: got {3: 0.04}; must be values by name": lambda s, d: s.with_values({3: 0.04}),
+    "1 validation error for Scene\nexchange\n  got []": lambda s, d: s.with_values(
+        {"exchange": [], "exchange.mixing": 1}
+    ),
+    "1 validation error for Scene\nflow\n  got array(": lambda s, d: s.with_values({"flow.kind": np.zeros(2)}),
+    "path: got 3; must be a path; such as path='outputs/mine'": lambda s, d: hpgr.Scene.from_file(3),
+    "path: got 'a\\x00'; must be a path": lambda s, d: hpgr.Scene.from_file("a\0"),
+    f"{Path(__file__).parent}: is no regular file": lambda s, d: hpgr.Scene.from_file(Path(__file__).parent),
+    "base: got array(": lambda s, d: hpgr.Scene.preset(np.zeros(2)),
+    "scene: got 'alike'; must be a scene": lambda s, d: hpgr.presets.fitting_alike("alike"),
+    "product: got None; must be a path": lambda s, d: hpgr.calibrate(s, None, None, OPERATIONS),
+    "operations: got True; must be a path": lambda s, d: hpgr.calibrate(s, None, PRODUCT, True),
+    "tests: got 'K-P1'; must be a list of names; such as tests=['K-P1']": lambda s, d: hpgr.calibrate(
+        s, None, PRODUCT, OPERATIONS, tests="K-P1"
+    ),
+    "fit: got 3; must be a list of names; such as fit=['sigma_m']": lambda s, d: hpgr.calibrate(
+        s, None, PRODUCT, OPERATIONS, 3
+    ),
+    "1 validation error for Scene\nfeed\n  got no kind": lambda s, d: hpgr.calibrate(
+        s, {}, PRODUCT, OPERATIONS, ["gamma"], ["K-P1"]
+    ),
+    "client: got 'x'; must be a dask client; such as": lambda s, d: sweep(s, {"gap": [0.04]}, client="x"),
+    "folder: got 3; must be a path": lambda s, d: sweep(s, {"gap": [0.04]}, folder=3),
+    "folder: got 4; must be a path": lambda s, d: open_cases(4),
+    "replicates: got 1000": lambda s, d: sweep(s, {"gap": [0.04]}, replicates=10**400),
+    "max_cost: got None; must be": lambda s, d: sweep(s, {"gap": [0.04]}, tolerance=0.1, max_cost=None),
+    "a scene has no field 3; did you mean": lambda s, d: sweep(s, {3: [0.04]}),
+    "rolls.gap: got b'x'; an axis is a list": lambda s, d: sweep(s, {"gap": b"x"}),
+    "rolls.gap, rolls.speed: got [3]; must be a value of each": lambda s, d: sweep(s, {("gap", "speed"): [3]}),
     "dataset: got 3; must be a Dataset; such as": lambda s, d: hpgr.passing(3),
     "dataset: got 4; must be a Dataset; such as": lambda s, d: hpgr.throughput(4),
     "dataset: got 5; must be a Dataset; such as": lambda s, d: hpgr.peak_pressure(5),

@@ -200,8 +200,8 @@ def test_bad_axes_are_refused_before_anything_runs(base, monkeypatch, axes, word
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"replicates": 0}, "replicates: got 0; must be a whole number, at least 1"),
-        ({"replicates": 1.5}, "replicates: got 1.5; must be a whole number, at least 1"),
+        ({"replicates": 0}, "replicates: got 0; must be a whole number from 1 to 1,000,000"),
+        ({"replicates": 1.5}, "replicates: got 1.5; must be a whole number from 1"),
         ({"threads": 0}, "threads: got 0"),
         ({"seed": -1}, "seed: got -1"),
         ({"timeout": 0}, "timeout: got 0"),

@@ -196,8 +196,8 @@ def _sizes(sieves) -> np.ndarray:
     given = [sieves] if isinstance(sieves, str) else np.atleast_1d(np.asarray(sieves, dtype=object)).tolist()
     try:
         found = np.array([parse(size, "m") if isinstance(size, str) else size for size in given], dtype=float)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"sieves: got {sieves!r}; {error}; such as ['1 mm'], or [0.001] in m") from None
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"sieves: got {sieves!r:.80}; {error}; such as ['1 mm'], or [0.001] in m") from None
     if not (found > 0).all():
         raise ValueError(f"sieves: got {sieves!r}; must be sizes above 0 in m; such as ['1 mm'], or [0.001]")
     return found
@@ -217,7 +217,7 @@ def _require_sizes(dataset: xr.Dataset, point: int) -> None:
     _require(dataset)
     if "passing" not in dataset:
         raise ValueError("the Dataset holds no sizes: it is stress only (resolution.cells = 0); simulate it with cells")
-    if not isinstance(point, numbers.Integral):
+    if not isinstance(point, numbers.Integral) or isinstance(point, bool):
         raise ValueError(f"point: got {point!r}; must be a whole number; take -1 for the exit")
     points = dataset.sizes.get("point")
     if points is not None and not -points <= point < points:

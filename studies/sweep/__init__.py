@@ -5,13 +5,12 @@ instead of being computed again. Whatever a case does, only its own place in the
 and message beside it. What is heavy loads late, for a command's `--help` does without.
 """
 
-import numbers
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from hpgr.fields import check_number, check_seed
+from hpgr.fields import check_count, check_number, check_seed, path_of
 from hpgr.scene import Scene, check_scene
 from studies.sweep.space import Space, SweepSpec, axes_of
 
@@ -116,17 +115,20 @@ def sweep(
             "rolls.gap: got it beside rolls.specific_pressing_force, under which the gap floats; give one of them"
         )
     check_seed("seed", seed)
-    for name, value in {"replicates": replicates, "threads": threads}.items():
-        if not isinstance(value, numbers.Integral) or value < 1:
-            raise ValueError(f"{name}: got {value!r}; must be a whole number, at least 1; such as {name}=2")
-    for name, value in {"tolerance": tolerance, "max_cost": max_cost, "timeout": timeout}.items():
+    check_count("replicates", replicates)
+    check_count("threads", threads)
+    check_number("max_cost", max_cost)
+    for name, value in {"tolerance": tolerance, "timeout": timeout}.items():
         if value is not None:
             check_number(name, value)
     base = scene.with_values({"resolution.record": record})
     if record != "product" and folder is None:
         raise ValueError(f"folder: got None; record={record!r} needs a folder, which takes a file of each case")
+    folder = None if folder is None else path_of("folder", folder)
     from studies.sweep import assemble, cases, isolated, run
 
+    if client is not None:
+        run.check_client(client)
     spec = SweepSpec(base, seed, tolerance, max_cost, timeout, cases.code_version())
     task = run.run_batch if timeout is None else isolated.run_isolated
     with ExitStack() as stack:

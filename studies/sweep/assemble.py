@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from hpgr.fields import path_of
 from hpgr.results import metrics, schema
 from hpgr.scene import Scene
 from studies.sweep import netcdf
@@ -188,7 +189,7 @@ def open_cases(folder: str | Path) -> xr.Dataset:
     (1, 1)
     >>> folder.cleanup()
     """
-    folder = Path(folder)
+    folder = path_of("folder", folder)
     told = _manifest(folder / _MANIFEST)
     space = Space({dim: Axis(**axis) for dim, axis in told["axes"].items()}, told["replicates"])
     values: dict[str, Any] = {"status": np.array(told["status"]).reshape(space.shape)}

@@ -292,6 +292,14 @@ def _prediction(plan: Plan, workers: int) -> str:
 # ---- dask
 
 
+def check_client(client: Any) -> None:
+    """Raise TypeError if an argument is no dask client."""
+    from distributed import Client
+
+    if not isinstance(client, Client):
+        raise TypeError(f"client: got {client!r:.80}; must be a dask client; such as distributed.Client(address)")
+
+
 def active_client() -> Any:
     """Return the client that this process has made the default; None if there is none."""
     from distributed import default_client

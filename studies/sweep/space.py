@@ -255,7 +255,7 @@ def _given(space: Any) -> Iterator[tuple[Any, Any]]:
 def _scene_axis(scenes: Any) -> Axis:
     if not isinstance(scenes, Mapping) or not scenes or not all(isinstance(one, Scene) for one in scenes.values()):
         raise ValueError(
-            f"{SCENE}: got {scenes!r}; must be named scenes; such as {{'soft': one_scene, 'hard': another_scene}}"
+            f"{SCENE}: got {scenes!r:.80}; must be named scenes; such as {{'soft': one_scene, 'hard': another_scene}}"
         )
     parts = [name for name in Scene.model_fields if name not in ("remark", "resolution")]  # compared at one resolution
     return Axis([{part: getattr(scene, part) for part in parts} for scene in scenes.values()], list(map(str, scenes)))
@@ -263,7 +263,8 @@ def _scene_axis(scenes: Any) -> Axis:
 
 def _columns(name: Any, values: Any) -> Iterator[_Column]:
     if isinstance(name, tuple):
-        fields, rows = [field_of(each) for each in name], [list(row) for row in _listed(name, values)]
+        fields = [field_of(each) for each in name]
+        rows = [list(row) if isinstance(row, Iterable) else [row] for row in _listed(name, values)]
         uneven = next((row for row in rows if len(row) != len(fields)), None)
         if uneven is not None:
             raise ValueError(f"{', '.join(fields)}: got {uneven}; must be a value of each of the {len(fields)} fields")
@@ -300,8 +301,8 @@ def _with_unit(field: str, values: Any) -> list:
 
 
 def _listed(name: Any, values: Any) -> list:
-    if isinstance(values, str) or not isinstance(values, Iterable):
-        raise ValueError(f"{name}: got {values!r}; an axis is a list of values; such as [{values!r}]")
+    if isinstance(values, str | bytes) or not isinstance(values, Iterable):
+        raise ValueError(f"{name}: got {values!r:.80}; an axis is a list of values; such as [{values!r}]")
     found = list(values)
     if not found:
         raise ValueError(f"{name}: got no values; an axis needs at least one; give values or leave the axis out")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 from pydantic import ValidationError
 
 from hpgr import presets
-from hpgr.fields import faults_of, show, unit_shown
+from hpgr.fields import check_count, check_number, faults_of, show, unit_shown
 from hpgr.scene import Scene, field_info
 from studies import command as line
 from studies.command import Report, shown_as
@@ -136,14 +136,14 @@ def _run(study: Study, options: Options) -> Report:
 
 
 def _check(options: Options) -> None:
-    if min(options.workers, options.replicates) < 1:
-        raise ValueError(f"got --workers {options.workers} --replicates {options.replicates}; both must be at least 1")
-    if options.timeout is not None and not 0.1 <= options.timeout <= 1e6:
-        raise ValueError(f"--timeout: got {options.timeout:g}; must be 0.1 to 1,000,000 s; such as 60")
+    check_count("--workers", options.workers)
+    check_count("--replicates", options.replicates)
+    check_number("--max-cost", options.max_cost)
+    if options.timeout is not None:
+        check_number("--timeout", options.timeout)
     if options.tolerance is None:
         return
-    if not 1e-4 <= options.tolerance <= 0.5:
-        raise ValueError(f"--tolerance: got {options.tolerance:g}; must be within 0.0001 to 0.5; such as 0.01")
+    check_number("--tolerance", options.tolerance)
     given = [name for name in ("level", "cells", "points") if getattr(options, name) is not None]
     if given:
         raise ValueError(
