@@ -150,12 +150,7 @@ def _lines(path: str | Path) -> list[tuple[int, list[str]]]:
 def text_of(path: str | Path) -> str:
     """Return the text of a file that is a regular one, not too large, and text.
 
-    Raises
-    ------
-    OSError
-        If it cannot be opened.
-    ValueError
-        If it is anything else.
+    OSError if it cannot be opened; ValueError if it is anything else.
     """
     status = os.stat(path)  # before it is opened: a pipe would make us wait, a device never end
     if not stat.S_ISREG(status.st_mode):

@@ -53,6 +53,8 @@ class Estimate(NamedTuple):
 def refine(scene: Scene, tolerance: float, run: Run, max_cost: float = 60.0, seed: int = 0) -> Estimate:
     """Return the resolution at which the estimated error of `scene` is within `tolerance`.
 
+    ValueError if the tolerance is out of range, or cannot be met under `max_cost`; the message has the predicted cost.
+
     Parameters
     ----------
     scene : Scene
@@ -66,11 +68,6 @@ def refine(scene: Scene, tolerance: float, run: Run, max_cost: float = 60.0, see
         Predicted seconds that pilot and final run may take together.
     seed : int
         Seed of the pilot runs.
-
-    Raises
-    ------
-    ValueError
-        If the tolerance is out of range, or cannot be met under `max_cost`; the message has the predicted cost.
     """
     check_number("tolerance", tolerance)
     spent = _Purse(run, tolerance, max_cost)

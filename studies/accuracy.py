@@ -106,10 +106,7 @@ def main(options: Options) -> cli.Report:
 def study(scene: Scene, plan: Plan, seed: int = 0, progress: bool = False) -> "xr.Dataset":
     """Return the errors and wall times of `scene` over every ladder and the grid of `plan`.
 
-    Raises
-    ------
-    ValueError
-        If the scene has no cells, a single one, or exchange; or there are fewer than 2 replicates.
+    ValueError if the scene has no cells, a single one, or exchange; or there are fewer than 2 replicates.
     """
     from hpgr import run
     from hpgr.results import schema

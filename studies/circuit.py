@@ -101,10 +101,7 @@ def _classes(passing) -> np.ndarray:
 def steady(scene: Scene, returned: Screen | EdgeRecycle, seed: int = 0, replicate: int = 0) -> Closed:
     """Return the steady state of the circuit, `scene.feed` being its fresh feed.
 
-    Raises
-    ------
-    ValueError
-        If the recycle grows without end, or does not settle.
+    ValueError if the recycle grows without end, or does not settle.
     """
     from hpgr.bed.loaded import Beds
     from hpgr.run import run_scene

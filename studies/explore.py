@@ -50,13 +50,7 @@ def main(options: Options) -> cli.Report:
 
 
 def chart_library() -> str:
-    """Return the source of plotly.js.
-
-    Raises
-    ------
-    ValueError
-        If the Python package that carries it is not installed.
-    """
+    """Return the source of plotly.js; ValueError if the Python package that carries it is not installed."""
     try:
         from plotly.offline import get_plotlyjs
     except ImportError:
@@ -70,10 +64,7 @@ def chart_library() -> str:
 def opened(path: Path) -> "xr.Dataset":
     """Return the Dataset of a NetCDF file that may be anybody's, read whole.
 
-    Raises
-    ------
-    ValueError
-        If there is no such file, or it is no NetCDF file, or one that is not safe to open.
+    ValueError if there is no such file, or it is no NetCDF file, or one that is not safe to open.
     """
     from studies.sweep.netcdf import open_result
 

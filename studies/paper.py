@@ -76,12 +76,8 @@ def study(
 
     Fields are over (streamline, point), the left roll to the right one, mid-plane and outermost streamlines included;
     products over (product_streamline, sieve), the mid-plane to the roll. Where single points are drawn, figures 3c,
-    3d and the start-up, there are `shown_points` on a streamline.
-
-    Raises
-    ------
-    ValueError
-        If there is no bed to draw, or nothing to crush.
+    3d and the start-up, there are `shown_points` on a streamline. ValueError if there is no bed to draw, or nothing to
+    crush.
 
     Examples
     --------

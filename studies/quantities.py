@@ -69,18 +69,13 @@ class Quantity(NamedTuple):
 
 
 def quantity_of(name: str) -> Quantity:
-    """Return the figure with this name.
+    """Return the figure with this name; ValueError if a run has none of that name.
 
     Examples
     --------
     >>> from studies.quantities import quantity_of
     >>> quantity_of("passing 6 mm").sieve, quantity_of("throughput").value("360 t/h")
     (0.006, 100.0)
-
-    Raises
-    ------
-    ValueError
-        If a run has none of that name.
     """
     from hpgr.results import schema  # late: `--help` does without
 

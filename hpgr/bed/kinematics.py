@@ -56,10 +56,7 @@ class StepStrains(NamedTuple):
 def move(geometry: Geometry, flow: FlowConstants, surface_speed: float, points: int) -> tuple[Kinematics, StepStrains]:
     """Lay `points` material points on each streamline, equal time steps apart, the last at the exit.
 
-    Raises
-    ------
-    ValueError
-        If neighbouring points are closer than 1e-9 of the bed's height.
+    ValueError if neighbouring points are closer than 1e-9 of the bed's height.
     """
     y, speed, *rates, across, flux, volumetric, shear = np.zeros((8, geometry.xi.size, points))
     time_step = 0.0

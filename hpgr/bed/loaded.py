@@ -99,13 +99,7 @@ class LoadedBed(NamedTuple):
 
 
 def load_bed(inputs: BedInputs) -> LoadedBed:
-    """Return the loaded bed.
-
-    Raises
-    ------
-    ValueError
-        If material points coincide.
-    """
+    """Return the loaded bed; ValueError if material points coincide."""
     xi, every = centres(inputs.streamlines), inputs.elasticity.substeps
     walled = inputs.between_rolls(np.append(xi, 1.0))  # the roll itself, whose force and power are wanted
     motion, strains, state = bear(inputs, walled)

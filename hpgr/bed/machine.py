@@ -108,10 +108,7 @@ def operating_gap(scene: Scene, specific_pressing_force: float | str) -> float:
 def float_gap(scene: Scene) -> Scene:
     """Return the scene with the gap at which its specific pressing force is carried; as it is if it has none.
 
-    Raises
-    ------
-    ValueError
-        If no gap carries that force.
+    ValueError if no gap carries that force.
     """
     wanted = scene.rolls.specific_pressing_force
     if wanted is None:

@@ -47,13 +47,9 @@ class Tessellation(NamedTuple):
 def tessellate(geometry: Geometry, x: np.ndarray, y: np.ndarray, rim: np.ndarray) -> Tessellation:
     """Return the Voronoi cells of material points (streamline, point), m, clipped to the bed.
 
-    `rim` holds the heights of the entry row on the mid-plane and on the outermost streamline, m.
-
-    Raises
-    ------
-    ValueError
-        If the cells do not tile the bed to 1e-9 of its area, or a point has no cell: the points lie too
-        close together for double precision.
+    `rim` holds the heights of the entry row on the mid-plane and on the outermost streamline, m. ValueError if the
+    cells do not tile the bed to 1e-9 of its area, or a point has no cell: the points lie too close together for double
+    precision.
     """
     points = np.column_stack([x.ravel(), y.ravel()])
     try:

@@ -169,10 +169,7 @@ def reduction_ratio(dataset: xr.Dataset, percent: float = 80, total: bool = Fals
 def scene_of(dataset: xr.Dataset) -> Scene:
     """Return the scene in the attributes of a result that may be anybody's; no file that it names is opened.
 
-    Raises
-    ------
-    ValueError
-        If there is none, or it is none.
+    ValueError if there is none, or it is none.
     """
     text = dataset.attrs.get("scene")
     if not isinstance(text, str) or len(text) > _MOST_SCENE:
@@ -266,10 +263,7 @@ def _recorded_passing(dataset: xr.Dataset, point: int) -> xr.DataArray:
 def between_sieves(found: xr.DataArray, wanted: np.ndarray) -> xr.DataArray:
     """Return mass fractions (..., sieve) at other sizes (m), linear in log size between the recorded sieves.
 
-    Raises
-    ------
-    ValueError
-        If a size lies outside the recorded sieves.
+    ValueError if a size lies outside the recorded sieves.
     """
     known = found["sieve"].values
     outside = wanted[(wanted < known[0]) | (wanted > known[-1])]

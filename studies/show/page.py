@@ -39,10 +39,8 @@ _MOST_LOST = 10  # lost operating points that the page lists; the others tell wh
 def page_data(result: xr.Dataset, sieve: float, name: str) -> dict[str, Any]:
     """Return everything the page of a sweep holds; `sieve`, in m, is that whose percent passing is shown first.
 
-    Raises
-    ------
-    ValueError
-        If the Dataset is no sweep, holds no result, is too large for a page, or the sieve is not within its sieves.
+    ValueError if the Dataset is no sweep, holds no result, is too large for a page, or the sieve is not within its
+    sieves.
 
     Examples
     --------

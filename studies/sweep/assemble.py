@@ -133,10 +133,7 @@ def _blank(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
 def write_manifest(plan: Plan, result: xr.Dataset) -> None:
     """Write what `open_cases` needs: axes, and the address and status of every case.
 
-    Raises
-    ------
-    OSError
-        If it cannot be written; the one of an earlier sweep is then left as it was.
+    OSError if it cannot be written; the one of an earlier sweep is then left as it was.
     """
     told = {
         "axes": json.loads(json.dumps({dim: axis._asdict() for dim, axis in plan.space.axes.items()}, default=plain)),

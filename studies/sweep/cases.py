@@ -125,12 +125,7 @@ def _little(dtype: np.dtype) -> np.dtype:
 def read_packed(file: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return header and arrays of the record that begins where `file` stands.
 
-    Raises
-    ------
-    EOFError
-        If the file ends here, or within the record.
-    Damaged
-        If these bytes are no intact record.
+    EOFError if the file ends here, or within the record; Damaged if these bytes are no intact record.
     """
     head, crc = _exactly(file, _HEAD.size), _exactly(file, _CRC.size)
     magic, text_size, payload_size, checksum = _HEAD.unpack(head)
@@ -277,7 +272,7 @@ class Driver(NamedTuple):
 
 
 class CaseFolder:
-    """A folder of finished cases that this driver reads and adds to.
+    """A folder of finished cases that this driver reads and adds to; OSError if it cannot be written to.
 
     Parameters
     ----------
@@ -285,11 +280,6 @@ class CaseFolder:
         Made if it is not there.
     recompute : bool
         Whether to pass over what is in it already, so that everything is computed again.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written to.
     """
 
     def __init__(self, folder: str | Path, recompute: bool = False):
@@ -394,13 +384,7 @@ class CaseFolder:
             self.flush()
 
     def flush(self) -> None:
-        """Put on disk what is waiting.
-
-        Raises
-        ------
-        OSError
-            If that fails; what was on disk before is as it was.
-        """
+        """Put on disk what is waiting; OSError if that fails; what was on disk before is as it was."""
         if self._waiting:
             self._write(b"".join(self._waiting))
             self._waiting, self._waiting_bytes = [], 0

@@ -141,10 +141,7 @@ def remove_leftovers(folder: Path) -> None:
 def replace(path: str | Path, write: Callable[[Path], object]) -> None:
     """Let `write` make a file under a temporary name, then put it in the place of `path`.
 
-    Raises
-    ------
-    OSError
-        If the folder or the file cannot be written; nothing is left behind.
+    OSError if the folder or the file cannot be written; nothing is left behind.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -209,12 +206,8 @@ def open_result(path: str | Path) -> xr.Dataset:
 def read_variable(path: str | Path, name: str, address: str | None = None) -> np.ndarray:
     """Return one variable of a NetCDF file, looked at as by `open_result`; any number of threads may call this.
 
-    Raises
-    ------
-    ValueError
-        If the file is foreign or, where an address is given, is not the case with that address.
-    OSError
-        If it cannot be read, or its checksums tell of damage.
+    ValueError if the file is foreign or, where an address is given, is not the case with that address; OSError if it
+    cannot be read, or its checksums tell of damage.
     """
     with _opened(path) as file:
         if address is not None and getattr(file, "address", None) != address:
@@ -269,14 +262,8 @@ def _look(path: Path) -> tuple[tuple[int, ...], str]:
 
     HDF5, in which NetCDF-4 is stored, can take values from any file that the reader may read (external storage,
     virtual datasets, external links), and load filters as code; and links in a circle keep its readers for ever.
-    Only names and layouts are looked at here, no values.
-
-    Raises
-    ------
-    ValueError
-        Naming the variable and what is wrong with it, or if it is no NetCDF file.
-    OSError
-        If it cannot be read, or its checksum tells of damage.
+    Only names and layouts are looked at here, no values. ValueError naming the variable and what is wrong with it, or
+    if it is no NetCDF file; OSError if it cannot be read, or its checksum tells of damage.
     """
     identity = _identity(path.stat())
     if identity in _looked_at:

@@ -339,12 +339,7 @@ def workers_of(client: Any) -> int:
 def dispatched(plan: Plan, client: Any, task: Task) -> Iterator[CaseResult]:
     """Yield the result of every case of the plan as it comes in, computed or read back, in no particular order.
 
-    Raises
-    ------
-    ConnectionError
-        If the scheduler is lost.
-    OtherCode
-        If a worker has other code than the driver.
+    ConnectionError if the scheduler is lost; OtherCode if a worker has other code than the driver.
     """
     finished: queue.SimpleQueue = queue.SimpleQueue()
     flying: dict[Any, list[Case]] = {}

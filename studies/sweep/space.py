@@ -189,10 +189,7 @@ def _fields_by_name() -> dict[str, list[str]]:
 def field_of(name: str) -> str:
     """Return the dotted name of the scene field that a dotted or plain name means, such as "gap".
 
-    Raises
-    ------
-    ValueError
-        If there is none, or several.
+    ValueError if there is none, or several.
     """
     known = _fields_by_name().get(name, [])
     if not known:
@@ -217,15 +214,12 @@ class _Column(NamedTuple):
 def axes_of(space: "Mapping[Any, Any] | xr.Dataset") -> dict[str, Axis]:
     """Return the axes of a space, their values in SI, refusing what no scene could take.
 
+    ValueError naming the field, the value and the remedy.
+
     Parameters
     ----------
     space : mapping or xarray.Dataset
         As `studies.sweep.sweep` takes it.
-
-    Raises
-    ------
-    ValueError
-        Naming the field, the value and the remedy.
     """
     if not isinstance(space, Mapping):
         raise ValueError(
@@ -354,10 +348,7 @@ def _joined(axis: Axis | None, column: _Column) -> Axis:
 def ends_of(ranges: Mapping[str, tuple[Any, Any]]) -> dict[str, tuple[float, float]]:
     """Return lowest and highest value of fields by dotted name, SI.
 
-    Raises
-    ------
-    ValueError
-        If a field is none, or its range is none.
+    ValueError if a field is none, or its range is none.
     """
     found = {}
     for name, ends in ranges.items():
