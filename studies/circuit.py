@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import ValidationError
 
-from hpgr.fields import Frozen, Metres, Number, faults_of, quantity, show
+from hpgr.fields import Frozen, Metres, Number, check_count, check_seed, faults_of, quantity, show
 from hpgr.laws.feed import TableFeed
-from hpgr.scene import Scene
+from hpgr.scene import Scene, check_scene
 from studies import command as line
 from studies.command import Report, shown_as
 from studies.sweep.space import Case, CaseResult, Space, SweepSpec, axes_of
@@ -195,8 +195,10 @@ def close_circuit(
 
     Raises
     ------
+    TypeError
+        If `scene` is none.
     ValueError
-        If no point has a steady state.
+        If what goes back is no separation, or no point has a steady state.
 
     Examples
     --------
@@ -210,8 +212,13 @@ def close_circuit(
     """
     from studies.sweep.assemble import assemble
 
+    check_scene(scene)
+    check_count("replicates", replicates)
+    check_seed("seed", seed)
+    if not isinstance(returned, Screen | EdgeRecycle):
+        raise ValueError(f"returned: got {returned!r:.80}; must be what separates; such as Screen(cut_size='6 mm')")
     spec = SweepSpec(scene.with_values({"resolution.record": "product"}), seed)
-    space = Space(axes_of(space or {}), replicates)
+    space = Space(axes_of({} if space is None else space), replicates)
     results = [_case(spec, returned, case) for case in space.cases()]
     if not any(one.summary for one in results):
         raise ValueError(results[0].message)

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 
-from hpgr.fields import show
-from hpgr.scene import Scene, field_info
+from hpgr.fields import check_seed, show
+from hpgr.scene import Scene, check_scene, field_info
 from studies import command as line
 from studies.command import Report, shown_as
 from studies.quantities import Quantity, quantity_of, refuse_lost, with_sieves
@@ -113,6 +113,8 @@ def optimise(
 
     Raises
     ------
+    TypeError
+        If `scene` is none.
     ValueError
         If a figure or range is none, or nothing within the ranges meets the bounds; the message has what is reached.
 
@@ -126,10 +128,23 @@ def optimise(
     >>> best.binding
     ['passing 6 mm >= 60 %']
     """
+    check_scene(scene)
+    check_seed("seed", seed)
     if (minimise is None) == (maximise is None):
         raise ValueError("minimise: give a figure to minimise or one to maximise; such as minimise='specific_energy'")
+    if not over:
+        raise ValueError(f"over: got {over!r:.80}; must be fields and their ranges; such as {{'gap': (0.04, 0.06)}}")
+    if not isinstance(subject_to, Mapping | None):
+        raise ValueError(f"subject_to: got {subject_to!r:.80}; must be bounds; such as {{'passing 6 mm': '>= 60 %'}}")
     limits = [_limit(name, text) for name, texts in (subject_to or {}).items() for text in np.atleast_1d(texts)]
-    search = _Search(scene, ends_of(over), quantity_of(minimise or maximise), limits, -1 if maximise else 1, seed)
+    search = _Search(
+        scene,
+        ends_of(over),
+        quantity_of(minimise if maximise is None else maximise),
+        limits,
+        -1 if minimise is None else 1,
+        seed,
+    )
     tradeoff = search.design(options)
     without_effect = search.without_effect()
     best = search.descend()

@@ -79,11 +79,11 @@ def quantity_of(name: str) -> Quantity:
     """
     from hpgr.results import schema  # late: `--help` does without
 
-    first, _, size = name.strip().partition(" ")
+    first, _, size = str(name).strip().partition(" ")
     if first == _PASSING and size:
         sieve = parse(size, "m")
         return Quantity("passing_total", "1", f"passing {show(sieve, 'm')}", sieve)
-    variable = name.strip().lower().replace(" ", "_")
+    variable = str(name).strip().lower().replace(" ", "_")
     variable = _NAMES.get(variable, variable)
     entry = schema.VARIABLES.get(variable)
     if entry is None or entry.dims or variable == "flags":

@@ -19,7 +19,8 @@ from hpgr.grains import closed_form, kernels
 from hpgr.results import flags as limits
 from hpgr.results import schema
 from hpgr.run import load, run_scene, run_together
-from studies import open_cases
+from studies import close_circuit, open_cases, optimise
+from studies.circuit import Screen
 from studies.sweep import sweep
 
 INF = math.inf
@@ -507,6 +508,16 @@ NO_ARGUMENTS = {
     "a scene has no field 3; did you mean": lambda s, d: sweep(s, {3: [0.04]}),
     "rolls.gap: got b'x'; an axis is a list": lambda s, d: sweep(s, {"gap": b"x"}),
     "rolls.gap, rolls.speed: got [3]; must be a value of each": lambda s, d: sweep(s, {("gap", "speed"): [3]}),
+    "scene: got 'best'; must be a scene": lambda s, d: optimise("best", {"gap": (0.04, 0.06)}, "energy"),
+    "ranges: got 3; must be fields, each with two ends": lambda s, d: optimise(s, 3, "energy"),
+    "over: got {}; must be fields": lambda s, d: optimise(s, {}, "energy"),
+    "gap: got 0.04; must be lowest and highest value": lambda s, d: optimise(s, {"gap": 0.04}, "energy"),
+    "a run has no figure 3; give": lambda s, d: optimise(s, {"gap": (0.04, 0.06)}, maximise=3),
+    "subject_to: got 'x'; must be bounds": lambda s, d: optimise(s, {"gap": (0.04, 0.06)}, "energy", subject_to="x"),
+    "scene: got 'loop'; must be a scene": lambda s, d: close_circuit("loop", Screen(cut_size="6 mm")),
+    "returned: got '6 mm'; must be what separates": lambda s, d: close_circuit(s, "6 mm"),
+    "space: got []; must be fields": lambda s, d: close_circuit(s, Screen(cut_size="6 mm"), []),
+    "replicates: got 0; must be": lambda s, d: close_circuit(s, Screen(cut_size="6 mm"), replicates=0),
     "dataset: got 3; must be a Dataset; such as": lambda s, d: hpgr.passing(3),
     "dataset: got 4; must be a Dataset; such as": lambda s, d: hpgr.throughput(4),
     "dataset: got 5; must be a Dataset; such as": lambda s, d: hpgr.peak_pressure(5),

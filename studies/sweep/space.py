@@ -350,8 +350,14 @@ def ends_of(ranges: Mapping[str, tuple[Any, Any]]) -> dict[str, tuple[float, flo
 
     ValueError if a field is none, or its range is none.
     """
+    if not isinstance(ranges, Mapping):
+        raise ValueError(
+            f"ranges: got {ranges!r:.80}; must be fields, each with two ends; such as {{'gap': (0.04, 0.06)}}"
+        )
     found = {}
     for name, ends in ranges.items():
+        if not isinstance(ends, tuple | list) or len(ends) != 2:
+            raise ValueError(f"{name}: got {ends!r:.80}; must be lowest and highest value; such as ('40 mm', '60 mm')")
         low, high = found[field_of(name)] = tuple(_axis_value(field_of(name), end) for end in ends)
         if isinstance(low, str) or isinstance(high, str) or not -math.inf < low < high < math.inf:
             raise ValueError(f"{name}: got {ends[0]!r} to {ends[1]!r}; must be a range of numbers, lowest first")
