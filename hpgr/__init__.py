@@ -19,19 +19,12 @@ if TYPE_CHECKING:
 __version__ = version("hpgr")
 
 _HOMES = {
-    "Scene": "scene",
-    "Rolls": "scene",
-    "Bed": "scene",
-    "Exchange": "laws.exchange",
-    "Resolution": "scene",
-    "simulate": "run",
-    "passing": "results.metrics",
-    "percentile_size": "results.metrics",
-    "throughput": "results.metrics",
-    "peak_pressure": "results.metrics",
-    "reduction_ratio": "results.metrics",
-    "operating_gap": "bed.machine",
-    "calibrate": "calibration",
+    "scene": ("Bed", "Resolution", "Rolls", "Scene"),
+    "laws.exchange": ("Exchange",),
+    "run": ("simulate",),
+    "results.metrics": ("passing", "peak_pressure", "percentile_size", "reduction_ratio", "throughput"),
+    "bed.machine": ("operating_gap",),
+    "calibration": ("calibrate",),
 }
 
 __all__ = [
@@ -57,9 +50,10 @@ if not TYPE_CHECKING:  # or a type checker would take every name for an existing
     def __getattr__(name: str) -> Any:
         if name == "presets":
             return import_module("hpgr.presets")
-        if name not in _HOMES:
+        home = next((module for module, names in _HOMES.items() if name in names), None)
+        if home is None:
             raise AttributeError(f"module 'hpgr' has no attribute {name!r}")
-        value = getattr(import_module(f"hpgr.{_HOMES[name]}"), name)
+        value = getattr(import_module(f"hpgr.{home}"), name)
         globals()[name] = value
         return value
 

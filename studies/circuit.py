@@ -27,8 +27,8 @@ _SIEVES = np.round(10 ** (np.arange(241) / 40 - 6), 12)  # m, 40 a decade: betwe
 _SIZES = np.sqrt(_SIEVES * np.append(_SIEVES[0] / 10, _SIEVES[:-1]))  # of the classes below them
 _MOST_LOAD = 20.0  # recycle over fresh feed beyond which the circuit is taken to fill up
 _MOST_ITERATIONS = 200
-_CONVERGED = 1e-9  # of the fresh feed, by which the recycle changes no more; where grains break at random, in cells:
-_CELLS = 10.0
+_CONVERGED = 1e-9  # of the fresh feed, by which the recycle changes no more
+_CELLS = 10.0  # the same where grains break at random: the change that is of a few cells may go on for ever
 _KEPT = 12  # rounds that Anderson's acceleration (1965) combines; none where grains break at random: it feeds on noise
 
 
@@ -71,10 +71,8 @@ class EdgeRecycle(Frozen):
             raise ValueError("roll_width: got none; edge recycle needs the product of the edges; give a roll_width")
         slices = scene.roll_width.cut(scene.rolls.gap, scene.rolls.width)
         share = float(slices.share[slices.at_edge].sum())
-        return (
-            share * _classes(values["passing_width_edge"]),
-            (1 - share) * _classes(values["passing_width_centre"]),
-        )
+        edge, centre = (_classes(values[f"passing_width_{part}"]) for part in ("edge", "centre"))
+        return share * edge, (1 - share) * centre
 
 
 class Closed(NamedTuple):
@@ -120,23 +118,16 @@ def steady(scene: Scene, returned: Screen | EdgeRecycle, seed: int = 0, replicat
         load = back.sum() / product.sum()
         if load > _MOST_LOAD or inputs[-1].sum() > 2 * _MOST_LOAD:
             raise ValueError(_diverges(back))
-        smooth = result.solver == "closed form"
-        if residual <= (_CONVERGED if smooth else _noise(scene, feed.sum())):
-            # the last product shared out: what goes in is what goes out
-            return Closed(
-                fresh, back * (1 + load), product * (1 + load), result.values, result.diagnostics, iteration, residual
-            )
+        smooth, cells = result.solver == "closed form", scene.resolution.cells * scene.resolution.streamlines
+        if residual <= (_CONVERGED if smooth else _CELLS * feed.sum() / cells):
+            shared = (part * (1 + load) for part in (back, product))  # the last product: what goes in is what goes out
+            return Closed(fresh, *shared, result.values, result.diagnostics, iteration, residual)
         kept = _KEPT if smooth else 1
         inputs.append(np.maximum(_accelerated(inputs[-kept:], outputs[-kept:]), 0.0))
     raise ValueError(
         f"recycle: got a change of {residual:.2g} of the fresh feed after {iteration} rounds; must settle; give more "
         "cells or streamlines"
     )
-
-
-def _noise(scene: Scene, feed: float) -> float:
-    """Return the change of the recycle that is of a few cells, which may go on for ever."""
-    return _CELLS * feed / (scene.resolution.cells * scene.resolution.streamlines)
 
 
 def _diverges(back: np.ndarray) -> str:
@@ -229,10 +220,9 @@ def _case(spec: SweepSpec, returned: Screen | EdgeRecycle, case: Case) -> CaseRe
     """Return the steady state of one point, or why it has none."""
     try:
         found = steady(spec.base.with_values(case.values), returned, spec.seed, case.replicate)
-    except ValidationError as error:
-        return CaseResult(case.index, "refused", faults_of(error), {})
     except ValueError as error:
-        return CaseResult(case.index, "refused", str(error), {})
+        words = faults_of(error) if isinstance(error, ValidationError) else str(error)
+        return CaseResult(case.index, "refused", words, {})
     entries, values = _variables(), _figures(found)
     summary = {name: np.asarray(value, entries[name].dtype) for name, value in values.items() if name in entries}
     return CaseResult(case.index, "ok", "", summary, found.diagnostics)
@@ -261,24 +251,19 @@ def _variables() -> dict[str, Any]:
 
     per, sieve = "per unit of fresh feed", ("sieve",)
     rolls = {name: entry for name, entry in VARIABLES.items() if not {"point", "cell", "time"} & set(entry.dims)}
-    return (
-        {name: COORDINATES[name] for name in ("xi", "sieve")}
-        | rolls
-        | {
-            "circulating_load": Variable((), "1", "circulating load", "recycle over fresh feed"),
-            "fresh_feed": Variable((), "kg s-1", "fresh feed", "and product of the circuit"),
-            "product_energy": Variable(
-                (), "J kg-1", "specific energy of the product", "power over product of the circuit"
-            ),
-            "product_p80": Variable((), "m", "P80 of the circuit's product"),
-            "mass_balance": Variable((), "1", "fresh feed less product", per, np.float64),
-            "residual": Variable((), "1", "change of the recycle in the last round", per, np.float64),
-            "iterations": Variable((), "1", "rounds of the recycle"),
-            "feed_passing": Variable(sieve, "1", "mass fraction passing", "feed of the rolls"),
-            "recycle_passing": Variable(sieve, "1", "mass fraction passing", "what goes back"),
-            "product_passing": Variable(sieve, "1", "mass fraction passing", "product of the circuit"),
-        }
-    )
+    own = {
+        "circulating_load": Variable((), "1", "circulating load", "recycle over fresh feed"),
+        "fresh_feed": Variable((), "kg s-1", "fresh feed", "and product of the circuit"),
+        "product_energy": Variable((), "J kg-1", "specific energy of the product", "power over product of the circuit"),
+        "product_p80": Variable((), "m", "P80 of the circuit's product"),
+        "mass_balance": Variable((), "1", "fresh feed less product", per, np.float64),
+        "residual": Variable((), "1", "change of the recycle in the last round", per, np.float64),
+        "iterations": Variable((), "1", "rounds of the recycle"),
+        "feed_passing": Variable(sieve, "1", "mass fraction passing", "feed of the rolls"),
+        "recycle_passing": Variable(sieve, "1", "mass fraction passing", "what goes back"),
+        "product_passing": Variable(sieve, "1", "mass fraction passing", "product of the circuit"),
+    }
+    return {name: COORDINATES[name] for name in ("xi", "sieve")} | rolls | own
 
 
 _SHOWN = {
@@ -332,14 +317,10 @@ def main(options: Options) -> Report:
     space = dict(line.varied(text) for text in options.vary)
     result = close_circuit(line.base_scene(options), returned, space, options.replicates, options.seed)
     from studies.show import report
-
-    def drawn() -> Any:
-        from studies.show.plots.circuit import circuit_figure
-
-        return circuit_figure(result)
+    from studies.show.plots.circuit import circuit_figure
 
     lines = [table(result), *report.flagged(result)]
-    return Report(lines, [result, line.figure(drawn)], report.lost_cases(result))
+    return Report(lines, [result, line.figure(lambda: circuit_figure(result))], report.lost_cases(result))
 
 
 if __name__ == "__main__":

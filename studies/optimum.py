@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 
-from hpgr.fields import check_seed, show
+from hpgr.fields import check_seed, show, values_of
 from hpgr.scene import Scene, check_scene, field_info
 from studies import command as line
 from studies.command import Report, shown_as
@@ -186,8 +186,7 @@ class _Search:
         """Return the fields' values at a point; a field that does not matter keeps the scene's, within its range."""
         found = dict(zip(self.ends, between(self.ends, np.atleast_2d(unit))[0], strict=True))
         for field in set(self.ends) - set(self.free):
-            section, _, key = field.partition(".")
-            own, (low, high) = getattr(getattr(self.own, section), key, None), self.ends[field]
+            own, (low, high) = values_of(self.own).get(field), self.ends[field]
             found[field] = low if own is None else min(max(own, low), high)
         return found
 
@@ -384,16 +383,12 @@ def main(options: Options) -> Report:
         threads=options.workers,
         progress=True,
     )
-
-    def drawn() -> Any:
-        from studies.show.plots.optimum import optimum_figure
-
-        return optimum_figure(best)
+    from studies.show.plots.optimum import optimum_figure
 
     def write(path: Path, history: str) -> None:
         path.write_text(f"# {' '.join(history.split())}\n{as_toml(best.scene)}", encoding="utf-8")
 
-    return Report(str(best).splitlines(), [best.tradeoff, write, line.figure(drawn)])
+    return Report(str(best).splitlines(), [best.tradeoff, write, line.figure(lambda: optimum_figure(best))])
 
 
 def as_toml(scene: Scene) -> str:

@@ -211,13 +211,9 @@ def main(options: Options) -> Report:
     figures = options.figures or (*FIGURES, f"passing {options.sieve}")
     scene = line.base_scene(replace(options, scene=options.scene or str(options.posterior or "paper")))
     result = sensitivity(scene, ranges, figures, options.sample, options.seed, threads=options.workers, progress=True)
+    from studies.show.plots.sensitivity import sensitivity_figure
 
-    def drawn() -> Any:
-        from studies.show.plots.sensitivity import sensitivity_figure
-
-        return sensitivity_figure(result)
-
-    return Report([table(result)], [result, line.figure(drawn)])
+    return Report([table(result)], [result, line.figure(lambda: sensitivity_figure(result))])
 
 
 if __name__ == "__main__":

@@ -156,6 +156,7 @@ def catalogue() -> list[Row]:
     inf, nan = math.inf, math.nan
     absurd = {"resolution.points": 3, "resolution.streamlines": 40, "exchange": {"mixing": 100}}
     every = {"rolls.gap": nan, "rolls.speed": 0, "strength.weibull_modulus": -1, "feed.top_size": 0.6}
+    closed, euler = {"resolution.record": "product"}, {"elasticity.integrator": "euler"}
     hundreds = {"strength.weibull_modulus": inf, "strength.reference_strength": 1.0, "resolution.points": 801}
     return [
         Row("gap of 0", {"rolls.gap": 0}, "refused", "rolls.gap: got 0 mm"),
@@ -181,21 +182,11 @@ def catalogue() -> list[Row]:
         Row("exit solid fraction above its limit", {"rolls.entry_gap": 1.14}, "flagged", "solid_fraction_capped"),
         Row("M = 2", {"resolution.cells": 2}, "flagged", "few_cells"),
         Row("M = 3", {"resolution.cells": 3}, "flagged", "few_cells"),
-        Row(
-            "n = inf, closed form",
-            {"strength.cushioning": inf, "resolution.record": "product"},
-            "flagged",
-            "size_floor_reached",
-        ),
+        Row("n = inf, closed form", {"strength.cushioning": inf} | closed, "flagged", "size_floor_reached"),
         Row("gamma of 0.001", {"fragments.exponent": 1e-3}, "flagged", "size_floor_reached"),
         Row("hundreds of breaks", hundreds, "flagged", "size_floor_reached"),
         Row("c below 0", {"elasticity.exponent": -0.5}, "flagged", "tension_clamped"),
-        Row(
-            "c below 0, Euler",
-            {"elasticity.exponent": -0.5, "elasticity.integrator": "euler"},
-            "flagged",
-            "tension_clamped",
-        ),
+        Row("c below 0, Euler", {"elasticity.exponent": -0.5} | euler, "flagged", "tension_clamped"),
         Row("largest grain of 1.4 gaps", {"feed.top_size": 0.084}, "ok"),
         Row("swap sum below 1/2", {"exchange": {"segregation": 1e-3, "mixing": 1e-3}}, "ok"),
         Row("swap sum above 1/2", {"exchange": {}}, "substepped"),

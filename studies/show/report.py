@@ -92,6 +92,14 @@ def place_text(result: xr.Dataset, dim: str, index: int) -> str:
     return ", ".join(told(axis, axis.values[index]) for axis in along)
 
 
+def point_names(result: xr.Dataset, chosen: Iterable[int]) -> list[str]:
+    """Return operating points, by their numbers in `operating_points`, in words."""
+    axes = axes_of(result)
+    every = list(np.ndindex(*(result.sizes[name] for name in axes)))
+    told = ([place_text(result, name, k) for name, k in zip(axes, every[number], strict=True)] for number in chosen)
+    return [", ".join(texts) for texts in told]
+
+
 def operating_points(result: xr.Dataset) -> xr.Dataset:
     """Return the result with its swept dims stacked into one dimension `operating_point`."""
     axes = axes_of(result)
@@ -162,13 +170,13 @@ def points_table(result: xr.Dataset, points: xr.Dataset, found: dict[str, xr.Dat
 def _blocks(axes: dict[str, list[str]], columns: dict[str, list[str]]) -> list[dict[str, list[str]]]:
     """Return the columns in tables that a screen is wide enough for, each after the axes."""
     blocks, width = [dict(axes)], 0
+    axes_width = sum(2 + max(map(len, (key, *each))) for key, each in axes.items())
     for name, texts in columns.items():
-        width += 2 + max(map(len, (name, *texts)))
-        if width + sum(2 + max(map(len, (key, *each))) for key, each in axes.items()) > _WIDEST and len(
-            blocks[-1]
-        ) > len(axes):
+        own = 2 + max(map(len, (name, *texts)))
+        width += own
+        if axes_width + width > _WIDEST and len(blocks[-1]) > len(axes):
             blocks.append(dict(axes))
-            width = 2 + max(map(len, (name, *texts)))
+            width = own
         blocks[-1][name] = texts
     return blocks
 

@@ -14,6 +14,7 @@ A case counts as done if its record is intact, has its address, and the file of 
 it tells. Nothing is unpickled.
 """
 
+import contextlib
 import fcntl
 import functools
 import hashlib
@@ -160,9 +161,7 @@ def _exactly(file: BinaryIO, size: int) -> bytes:
 
 
 def _checksum(text: bytes, payload: bytes) -> bytes:
-    digest = hashlib.blake2b(text, digest_size=16)
-    digest.update(payload)
-    return digest.digest()
+    return hashlib.blake2b(text + payload, digest_size=16).digest()
 
 
 def pack_result(result: CaseResult, **header: Any) -> bytes:
@@ -341,10 +340,9 @@ class CaseFolder:
 
     def claim(self, address: str) -> bool:
         """Return whether the case is now this driver's to compute; False if a living driver is at it."""
-        if not _lock(self._lock, fcntl.F_WRLCK, _place(address)):
-            held = any(address in driver.claimed and driver.silence > _SILENT_SECONDS for driver in self._look())
-            if not held:
-                return False
+        free = _lock(self._lock, fcntl.F_WRLCK, _place(address))
+        if not free and not any(address in one.claimed and one.silence > _SILENT_SECONDS for one in self._look()):
+            return False
         self._held.add(address)
         os.write(self._claims, f"{address}\n".encode())
         return True
@@ -405,10 +403,8 @@ class CaseFolder:
         """Rename a damaged segment, and keep its intact records in a new one."""
         if intact:
             self._write(intact)
-        try:
+        with contextlib.suppress(FileNotFoundError):  # another driver was quicker
             path.rename(path.with_suffix(".damaged"))
-        except FileNotFoundError:  # another driver was quicker
-            return
 
 
 def _driver(path: Path, now: float) -> Driver | None:

@@ -19,7 +19,7 @@ _TEMPORARY = re.compile(r"\.hpgr-[0-9a-f]{16}(\.\w+)?")
 _SEAL = b"hpgr-blake2b:"  # behind the last byte of a file of ours, where HDF5 looks for nothing; then the checksum
 _DIGEST = 16  # bytes
 _CLASSIC = {b"CDF\x01", b"CDF\x02", b"CDF\x05"}  # how NetCDF-3 begins; any other start is left to HDF5
-_HARMLESS_FILTERS = {1: "deflate", 2: "shuffle", 3: "fletcher32", 4: "szip", 5: "nbit", 6: "scaleoffset"}
+_HARMLESS_FILTERS = range(1, 7)  # deflate, shuffle, fletcher32, szip, nbit, scaleoffset
 _MOST_ITEMS, _DEEPEST = (
     10_000,
     8,
@@ -286,10 +286,8 @@ def _checksum(file: BinaryIO, size: int) -> bytes:
     """Return the checksum of the first `size` bytes of a file."""
     file.seek(0)
     digest = hashlib.blake2b(digest_size=_DIGEST)
-    while size:
-        block = file.read(min(size, 1 << 20))
-        digest.update(block)
-        size -= len(block)
+    for start in range(0, size, 1 << 20):
+        digest.update(file.read(min(size - start, 1 << 20)))
     return digest.digest()
 
 

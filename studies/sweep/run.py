@@ -6,7 +6,7 @@ import queue
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -232,11 +232,8 @@ def results(plan: Plan, client: Any, threads: int, task: Task, progress: bool) -
     if not plan.left:
         return
     client = active_client() if client is None else client
-    if client is None:
-        with own_client(threads) as own:
-            yield from _computed(plan, own, task, progress)
-    else:
-        yield from _computed(plan, client, task, progress)
+    with own_client(threads) if client is None else nullcontext(client) as used:
+        yield from _computed(plan, used, task, progress)
 
 
 def _computed(plan: Plan, client: Any, task: Task, progress: bool) -> Iterator[CaseResult]:
@@ -345,7 +342,7 @@ def dispatched(plan: Plan, client: Any, task: Task) -> Iterator[CaseResult]:
     flying: dict[Any, list[Case]] = {}
     again: list[list[Case]] = []  # cases of batches that were lost, to be run one by one
     window = (_AHEAD_WHOLE if plan.spec.whole else _AHEAD) * workers_of(client)
-    idle = _Idle()
+    idle_since, patience = time.monotonic(), _PATIENCE
     try:
         while True:
             while len(flying) < window:
@@ -362,7 +359,11 @@ def dispatched(plan: Plan, client: Any, task: Task) -> Iterator[CaseResult]:
                 future = finished.get(timeout=_TICK)
             except queue.Empty:  # nothing yet, or only other drivers are at work
                 window = max(window, _AHEAD * workers_of(client)) if not plan.spec.whole else window
-                idle.tell(plan, bool(flying))
+                if flying:
+                    idle_since = time.monotonic()
+                elif time.monotonic() - idle_since > patience:
+                    say(f"waiting for {plan.left} cases that other drivers hold: {plan.kept.others()}")
+                    patience *= 2
                 continue
             batch = flying.pop(future)
             for result in _settle(future, batch, again):
@@ -372,20 +373,6 @@ def dispatched(plan: Plan, client: Any, task: Task) -> Iterator[CaseResult]:
     finally:
         for future in flying:
             future.cancel()
-
-
-class _Idle:
-    """Tells the user whom a driver without work of its own is waiting for."""
-
-    def __init__(self):
-        self._since, self._patience = time.monotonic(), _PATIENCE
-
-    def tell(self, plan: Plan, busy: bool) -> None:
-        if busy:
-            self._since = time.monotonic()
-        elif time.monotonic() - self._since > self._patience:
-            say(f"waiting for {plan.left} cases that other drivers hold: {plan.kept.others()}")
-            self._patience *= 2
 
 
 def _settle(future: Any, batch: list[Case], again: list[list[Case]]) -> Iterator[CaseResult]:

@@ -28,28 +28,17 @@ def circuit_figure(result: xr.Dataset) -> Figure:
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     _distributions(left, points.isel(operating_point=held[0]).mean("replicate"))
-    labels = _labels(result)
+    labels = report.point_names(result, range(points.sizes["operating_point"]))
     for k, (name, factor) in enumerate({"circulating_load": 100, "product_energy": 1 / 3600}.items()):
         panel = right if k == 0 else right.twinx()
         values = points[name].astype(float) * factor
-        style = {
-            "color": colours.batlow(0.2 + 0.5 * k),
-            "marker": "os"[k],
-            "linestyle": "-" if len(labels) > 1 else "none",
-        }
+        style = {"color": colours.batlow(0.2 + 0.5 * k), "marker": "os"[k]}
+        style["linestyle"] = "-" if len(labels) > 1 else "none"
         panel.errorbar(np.arange(len(labels)), values.mean("replicate"), report.spread(values), **style)
         panel.set_ylabel(("circulating load [%], circles", "energy of the product [kWh/t], squares")[k])
     right.set_xticks(np.arange(len(labels)), labels, rotation=20, ha="right")
     figure.supxlabel(f"Left: {labels[held[0]] or 'the scene'}. {result.attrs['returned']}", fontsize=9)
     return figure
-
-
-def _labels(result: xr.Dataset) -> list[str]:
-    axes = report.axes_of(result)
-    places = np.ndindex(*(result.sizes[name] for name in axes))
-    return [
-        ", ".join(report.place_text(result, name, k) for name, k in zip(axes, place, strict=True)) for place in places
-    ]
 
 
 def _distributions(panel, one: xr.Dataset) -> None:

@@ -116,15 +116,8 @@ def _sizes_across(panel, result: xr.Dataset) -> None:
     across = np.concatenate([-xi[::-1], xi])
     for name, marker, dash, lightness in (("p80", "o", "-", "0"), ("p50", "s", "--", "0.45")):
         values = 1e3 * result[name].values
-        panel.plot(
-            across,
-            np.concatenate([values[::-1], values]),
-            marker=marker,
-            linestyle=dash,
-            color=lightness,
-            markersize=4,
-            label=name.upper(),
-        )
+        style = {"marker": marker, "linestyle": dash, "color": lightness, "markersize": 4}
+        panel.plot(across, np.concatenate([values[::-1], values]), label=name.upper(), **style)
     for roll in (-1, 1):
         panel.axvline(roll, color="0.3", linewidth=3)
     panel.set(xlabel="position across the gap, roll to roll [half gaps]", ylabel="product size [mm]", xlim=(-1, 1))

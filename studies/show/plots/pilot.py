@@ -76,24 +76,13 @@ def figure_errors(panel, result: xr.Dataset, sources: list[str]) -> None:
             off = 100 * (result[name].sel(source=source) / measured[name] - 1).values
             if np.isfinite(off).any():
                 shift = 0.12 * (k - 1) + 0.035 * (j - 1)
-                panel.plot(
-                    place + shift,
-                    off,
-                    mark,
-                    color=_colour(k),
-                    fillstyle="full" if j == 0 else "none",
-                    markersize=6,
-                    label=name.replace("_", " ") if j == 0 else None,
-                )
+                own = {"fillstyle": "none"} if j else {"label": name.replace("_", " ")}
+                panel.plot(place + shift, off, mark, color=_colour(k), markersize=6, **own)
     for side in (-10, 10):
         panel.axhline(side, color="0.6", linewidth=0.8, linestyle=":")
     panel.axhline(0, color="0.3", linewidth=0.8)
-    panel.set_xticks(
-        place,
-        [f"{name}{'' if blind else ' (fitted)'}" for name, blind in zip(tests, result["blind"].values, strict=True)],
-        rotation=30,
-        fontsize=8,
-    )
+    named = [f"{name}{'' if blind else ' (fitted)'}" for name, blind in zip(tests, result["blind"].values, strict=True)]
+    panel.set_xticks(place, named, rotation=30, fontsize=8)
     panel.set(ylabel="predicted over measured - 1 [%]")
     panel.set_title(f"full: {sources[0]}; hollow: other models; dotted: 10 %", fontsize=10)
     panel.legend(fontsize=8)

@@ -63,11 +63,9 @@ def _title(result: xr.Dataset) -> str:
     """Return machine, ore and what is swept."""
     scene, swept = scene_of(result), _joined(report.axes_of(result)) or "nothing"
     rolls, ore, feed = scene.rolls, scene.strength, scene.feed
-    strength = (
-        f"{show(ore.reference_strength, 'Pa', 3)} at {show(ore.reference_size, 'm')}, w {ore.weibull_modulus:.3g}"
-    )
     return (
-        f"Rolls {show(rolls.diameter, 'm')} x {show(rolls.width, 'm')}; ore of {strength}; "
+        f"Rolls {show(rolls.diameter, 'm')} x {show(rolls.width, 'm')}; ore of "
+        f"{show(ore.reference_strength, 'Pa', 3)} at {show(ore.reference_size, 'm')}, w {ore.weibull_modulus:.3g}; "
         f"{feed.kind.replace('_', ' ')} feed to {show(feed.largest_grain, 'm')}; swept: {swept}"
     )
 
@@ -95,11 +93,8 @@ def _products(panels, result: xr.Dataset, sieve: float) -> bool:
     groups = _alike(np.concatenate([each.values.reshape(len(labels), -1) for each in across.values()], axis=1))
     chosen = [group[0] for group in groups]
     named = [labels[group[0]] + (f" (and {len(group) - 1} alike)" if len(group) > 1 else "") for group in groups]
-    for panel, (name, title, unit) in zip(
-        panels,
-        (("p80", "Product size", "P80 [mm]"), ("passing", "Fineness", f"below {show(sieve, 'm')} [%]")),
-        strict=False,
-    ):
+    drawn = (("p80", "Product size", "P80 [mm]"), ("passing", "Fineness", f"below {show(sieve, 'm')} [%]"))
+    for panel, (name, title, unit) in zip(panels, drawn, strict=False):
         flat = _across_half_gap(panel, across[name].isel(operating_point=chosen), result["xi"].values, named)
         panel.set(title=f"{title} to the roll" + (", flat within its noise" if flat else ""), ylabel=unit)
     handles, names = panels[0].get_legend_handles_labels()
@@ -202,13 +197,7 @@ def _shown_points(result: xr.Dataset) -> tuple[xr.Dataset, list[str], bool]:
     points = report.operating_points(result)
     held = np.flatnonzero(points["p80_total"].notnull().any("replicate").values)
     chosen = _thinned(held)
-    axes = report.axes_of(result)
-    places = np.unravel_index(chosen, [result.sizes[name] for name in axes])
-    labels = [
-        ", ".join(report.place_text(result, name, k) for name, k in zip(axes, place, strict=True))
-        for place in zip(*places, strict=True)
-    ]
-    return points.isel(operating_point=chosen), labels, chosen.size < held.size
+    return points.isel(operating_point=chosen), report.point_names(result, chosen), chosen.size < held.size
 
 
 def _thinned(numbers: np.ndarray) -> np.ndarray:
