@@ -6,11 +6,16 @@ from importlib import import_module
 from pathlib import Path
 
 
+def commands() -> dict[str, Path]:
+    """Return the file of every study by its name."""
+    known = {path.stem.replace("_", "-"): path for path in sorted(Path(__file__).parent.glob("[!_]*.py"))}
+    return {one: path for one, path in known.items() if '__name__ == "__main__"' in path.read_text(encoding="utf-8")}
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the study that the first argument names with the others; return its exit code."""
     name, *rest = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
-    known = {path.stem.replace("_", "-"): path for path in sorted(Path(__file__).parent.glob("[!_]*.py"))}
-    known = {one: path for one, path in known.items() if '__name__ == "__main__"' in path.read_text(encoding="utf-8")}
+    known = commands()
     if name in ("-h", "--help"):
         print("usage: hpgr STUDY [OPTIONS]; hpgr STUDY --help tells the options\n")
         for one, path in known.items():

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
-import tyro
 
 from hpgr.scene import Scene, levels
 from studies import command as cli
@@ -82,7 +81,7 @@ class Options:
     """Independent repetitions of every run, at least 2 (default: 32, with --quick 8)."""
     seed: cli.Seed = 0
     quick: cli.Quick = False
-    markdown: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    markdown: cli.Flag = False
     """Print every table, as markdown, instead of the short ones."""
     out: cli.Out = Path("outputs/accuracy.nc")
     plot: cli.Plot = True

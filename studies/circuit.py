@@ -294,11 +294,11 @@ class Options(line.Common):
     """Options of the closed circuit; sizes are text with a unit."""
 
     cut: Annotated[str | None, shown_as("LENGTH")] = None
-    """Cut size of the screen, such as "6 mm"."""
+    """Cut size of the screen, such as "6 mm"; needed but for --edge-recycle."""
     sharpness: Annotated[float, shown_as("ALPHA")] = 8.0
-    """Sharpness of the cut, by Whiten's curve."""
+    """Sharpness of the cut, by Whiten's curve, 0.1 to 1000."""
     bypass: Annotated[float, shown_as("PART")] = 0.0
-    """Part of the fines that goes with the oversize."""
+    """Part of the fines, 0 to 0.9, that goes with the oversize."""
     edge_recycle: line.Flag = False
     """Return the product of the roll's edges, in place of a screen's oversize."""
     vary: line.Vary = ()
@@ -314,7 +314,7 @@ def main(options: Options) -> Report:
         raise ValueError("--cut: give a screen's cut size, or --edge-recycle; such as --cut '6 mm'")
     screen = {"cut_size": options.cut, "sharpness": options.sharpness, "bypass": options.bypass}
     returned = EdgeRecycle() if options.edge_recycle else Screen(**screen)
-    space = dict(line.varied(text) for text in options.vary)
+    space = line.values_of(options.vary)
     result = close_circuit(line.base_scene(options), returned, space, options.replicates, options.seed)
     from studies.show import report
     from studies.show.plots.circuit import circuit_figure

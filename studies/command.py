@@ -37,22 +37,32 @@ Part = "xr.Dataset | Callable[[Path, str], object]"
 
 def shown_as(metavar: str, words: str | None = None) -> Any:
     """Return what has `--help` show an option's value as `metavar`, and describe it in these words."""
-    return tyro.conf.arg(metavar=metavar, help=words)
+    return tyro.conf.arg(metavar=metavar, help=words, help_behavior_hint=_default)
 
 
-Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]  # which is off unless it is given
+def _default(value: str) -> str:
+    """Return what `--help` says of a default; nothing where there is none, of which the words tell what it means."""
+    return "" if value in ("None", "") else f"(default: {value.replace(str(presets.DATA), 'hpgr/data')})"
+
+
+# which is off unless it is given
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
 _LEVELS = tuple(levels())
 
 _SCENES = f"preset ({', '.join(presets.NAMES)}), .toml or .json scene file, or .nc file of a study, whose scene it is"
 SceneName = Annotated[str, shown_as("PRESET|FILE", f"Base scene: {_SCENES}.")]
-_OF_FILE = "Default: paper, or the scene of the calibration's file."
-CalibratedScene = Annotated[str | None, shown_as("PRESET|FILE", f"Base scene: {_SCENES}. {_OF_FILE}")]
+_OF_FILE = "(default: paper, or the scene of the calibration's file)"
+CalibratedScene = Annotated[str | None, shown_as("PRESET|FILE", f"Base scene: {_SCENES} {_OF_FILE}.")]
 SceneNames = Annotated[
-    tuple[str, ...] | None, shown_as("PRESET|FILE ...", f"Scene, or scenes to compare: {_SCENES}. {_OF_FILE}")
+    tuple[str, ...] | None, shown_as("PRESET|FILE ...", f"Scene, or scenes to compare: {_SCENES} {_OF_FILE}.")
 ]
 Vary = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
     shown_as("FIELD=V1,V2,...", "Values of any scene field, or lo..hi:N, such as 'gap=40 mm..60 mm:5'; repeatable."),
+]
+Range = Annotated[
+    tyro.conf.UseAppendAction[tuple[str, ...]],
+    shown_as("FIELD=LO..HI", "Range of any scene field, such as 'gap=40 mm..60 mm'; repeatable."),
 ]
 Level = Annotated[
     Literal[_LEVELS] | None,
@@ -68,15 +78,17 @@ Streamlines = Annotated[
     int | None, shown_as("N", "Streamlines from the mid-plane to the roll, instead of the scene's.")
 ]
 Exchange = Annotated[
-    Flag, shown_as("", "Switch on segregation and mixing, as the scene says, or else with default strength.")
+    Flag, tyro.conf.arg(help="Switch on segregation and mixing, as the scene says, or else with default strength.")
 ]
 Replicates = Annotated[int, shown_as("N", "Independent repetitions of every operating point; they make the spread.")]
 Seed = Annotated[int, shown_as("N", "Seed of all randomness; the same seed gives the same bits.")]
 Sieve = Annotated[str, shown_as("LENGTH", "Sieve whose percent passing is shown.")]
-Quick = Annotated[Flag, shown_as("", "Fewer and coarser runs: seconds instead of minutes, to see what comes out.")]
+Quick = Annotated[
+    Flag, tyro.conf.arg(help="Fewer and coarser runs: seconds instead of minutes, to see what comes out.")
+]
 Out = Annotated[Path, shown_as("FILE", "NetCDF file to write; the figure goes beside it, as .png.")]
-Plot = Annotated[bool, shown_as("", "Draw the figure, or not.")]
-Overwrite = Annotated[Flag, shown_as("", "Replace files that are not this command's own earlier result.")]
+Plot = Annotated[bool, tyro.conf.arg(help="Draw the figure, or not.")]
+Overwrite = Annotated[Flag, tyro.conf.arg(help="Replace files that are not this command's own earlier result.")]
 
 
 @dataclass(frozen=True)
@@ -172,12 +184,26 @@ def varied(text: str) -> tuple[str, list | tuple]:
     return field, [round(value) for value in values] if isinstance(low, int) and isinstance(high, int) else values
 
 
+def values_of(texts: Sequence[str]) -> dict[str, list]:
+    """Return the values of each field that `--vary` is given for; a range in place of values is refused."""
+    return _all_of(list, texts, "values; such as 'gap=40 mm..60 mm:5'")
+
+
 def ranges(texts: Sequence[str]) -> dict[str, tuple]:
     """Return the range of each field that `--vary` is given for; values in place of a range are refused."""
-    found = dict(map(varied, texts))
-    listed = [name for name, values in found.items() if isinstance(values, list)]
-    if listed or not found:
-        raise ValueError(f"--vary: got {', '.join(listed) or 'nothing'}; must be ranges; such as 'gap=40 mm..60 mm'")
+    if not texts:
+        raise ValueError("--vary: got nothing; must be ranges; such as 'gap=40 mm..60 mm'")
+    return _all_of(tuple, texts, "ranges; such as 'gap=40 mm..60 mm'")
+
+
+def _all_of(kind: type, texts: Sequence[str], words: str) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for text in texts:
+        field, values = varied(text)
+        if field in found or not isinstance(values, kind):
+            told = f"{field} twice" if field in found else repr(text)
+            raise ValueError(f"--vary: got {told}; must be {words}, each field once")
+        found[field] = values
     return found
 
 

@@ -348,11 +348,11 @@ def _unbeaten(*figures: np.ndarray) -> np.ndarray:
 class Options(line.Common):
     """Options of the optimum; ranges and bounds are text with units."""
 
-    vary: line.Vary = ()
+    vary: line.Range = ()
     minimise: Annotated[str | None, shown_as("FIGURE")] = None
-    """What is to be least, such as specific_energy."""
+    """What is to be least, such as specific_energy; this or --maximise."""
     maximise: Annotated[str | None, shown_as("FIGURE")] = None
-    """What is to be most, such as throughput."""
+    """What is to be most, such as throughput; this or --minimise."""
     subject_to: Annotated[tuple[str, ...], shown_as("BOUND ...")] = ()
     """Bounds, such as "passing 6 mm >= 60 %" "throughput >= 200 t/h"."""
     scene: line.SceneName = "industrial"

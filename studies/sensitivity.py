@@ -29,7 +29,7 @@ _ORDERS = ("first_order", "total_order")
 class Options(line.Common):
     """Options of the sensitivity study; ranges are text with units, such as --vary "gap=40 mm..60 mm"."""
 
-    vary: line.Vary = ()
+    vary: line.Range = ()
     posterior: Annotated[Path | None, shown_as("FILE")] = None
     """NetCDF file of samples of scene fields, by dotted name along `sample`, such as a calibration's posterior."""
     figures: Annotated[tuple[str, ...] | None, shown_as("NAME ...")] = None

@@ -119,6 +119,7 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out.splitlines()[0].split()[:2] == ["press", "force"]
     with xr.open_dataset("outputs/circuit.nc") as read:
         assert read["product_passing"].dims == ("press_force", "replicate", "sieve")
-    assert main(["--cut", "8 mm", "--edge-recycle"]) == 2
+    assert main(["--cut", "8 mm", "--edge-recycle"]) == main(["--cut", "8 mm", "--vary", "gap=50 mm..60 mm"]) == 2
+    assert "'gap=50 mm..60 mm'; must be values; such as 'gap=40 mm..60 mm:5'" in capsys.readouterr().err
     assert main(["--edge-recycle", *small, "--overwrite"]) == 2
     assert "roll_width" in capsys.readouterr().err

@@ -15,6 +15,8 @@ from support import one_by_one
 
 import hpgr
 from studies import command, feed_sweep, gap_sweep, speed_sweep
+from studies.__main__ import commands
+from studies.__main__ import main as any_study
 from studies.sweep import run as running
 from studies.sweep.study import Options
 
@@ -500,6 +502,19 @@ def test_help_explains_every_option_and_loads_nothing_heavy(capsys):
     assert "python -m studies.gap_sweep" in told
     for preset in hpgr.presets.NAMES:
         assert preset in told
+
+
+@pytest.mark.parametrize("study", commands())
+def test_help_explains_every_option_and_tells_no_default_that_is_none(study, capsys):
+    with pytest.raises(SystemExit):
+        any_study([study, "--help"])
+    told = capsys.readouterr().out
+    assert not re.search(r"default:\s*(None|False)?\)|\(repeatable\)", told)
+    assert str(Path(hpgr.__file__).parent) not in re.sub(r"[\s│]", "", told)
+    options = re.split(r"^[│ ] (?=-)", told, flags=re.MULTILINE)
+    assert len(options) > 4
+    for option in options[2:]:
+        assert re.search(r"\s[A-Z]\w*[a-z]\w*,?\s.*\w\W*\.", option, re.DOTALL), option
 
 
 def test_a_feed_sweep_of_a_fitted_ore_shows_what_its_tests_cannot_tell(run):

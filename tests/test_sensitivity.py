@@ -1,5 +1,7 @@
 """Sobol indices on a function and on a scene that are known in closed form."""
 
+import re
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -90,5 +92,5 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     assert main(["--posterior", "posterior.nc", "--scene", "paper", "--figures", "power", "--out", "p", *small]) == 0
     with xr.open_dataset("p.nc") as read:
         assert read["total_order"].values == pytest.approx(1, abs=0.3)
-    assert main(["--vary", "gap=50 mm,60 mm"]) == 2
-    assert "must be ranges" in capsys.readouterr().err
+    assert main(["--vary", "gap=50 mm,60 mm"]) == main(["--vary", "gap=5 mm..6 mm", "--vary", "gap=5 mm..7 mm"]) == 2
+    assert re.search("'gap=50 mm,60 mm'; must be ranges.*\n.*gap twice; must be ranges", capsys.readouterr().err)

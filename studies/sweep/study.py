@@ -52,7 +52,7 @@ class Options:
     """Top sizes of the feed to sweep, such as --feed-top-size "40 mm" "60 mm"."""
     vary: line.Vary = ()
     sample: Annotated[int | None, shown_as("N")] = None
-    """Points of a Sobol design, drawn over the fields that --vary gives as a range, lo..hi."""
+    """Points of a Sobol design, drawn over the fields that --vary gives as a range, such as 'gap=40 mm..60 mm'."""
     calibration: Annotated[Path | None, shown_as("FILE")] = None
     """File of studies.pilot: 32 of its samples are run at every operating point; bands tell what it leaves open."""
     scene: line.SceneNames = None
@@ -84,7 +84,7 @@ class Options:
     csv: Annotated[Path | None, shown_as("FILE")] = None
     """Write one row per operating point in plant units, too, for a spreadsheet."""
     flags: line.Flag = False
-    """Describe every limit that operating points have hit."""
+    """Describe every limit that operating points have hit, not only name it."""
     overwrite: line.Overwrite = False
     dry_run: line.Flag = False
     """List the cases with their predicted memory and time, say which are finished already, and run none."""
