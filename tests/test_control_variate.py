@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from support import paper, sized
 
 from hpgr import passing, percentile_size, simulate
-from hpgr.grains import kernels, march, solve
+from hpgr.grains import march, solve
 from hpgr.grains.solve import Loaded
 from hpgr.laws.roll_width import WHOLE
 from hpgr.run import load
@@ -175,19 +175,16 @@ def test_percentiles_and_passing_agree(values):
 
 def test_exact_passing_is_corrected_by_counts():
     counts, complete = np.array([[0, 0, 2, 8], [0, 3, 3, 8]]), np.array([[0, 1, 4, 8], [0, 4, 8, 8]])
-    exact = np.array([[0.05, 0.02], [0.2, 0.5], [0.4, 0.9], [1.0, 1.0]])
-    passing = np.empty(counts.shape)
-    kernels.correct_passing(counts, complete, passing, exact)
+    exact = np.array([[0.05, 0.2, 0.4, 1.0], [0.02, 0.5, 0.9, 1.0]])
     # below every cell the ratio is that of the next sieve; 3 / 4 x 0.5 is more than 3 / 8 x 0.9
     wanted = [[0.0, 0.0, 0.2, 1.0], [0.75 * 0.02, 0.375, 0.375, 1.0]]
-    assert passing == pytest.approx(np.array(wanted))
-    kernels.correct_passing(0 * counts, 0 * complete, passing, exact)  # every cell is coarser than every sieve
-    assert np.array_equal(passing, exact.T)
+    assert solve.corrected(counts, complete, exact) == pytest.approx(np.array(wanted))
+    assert np.array_equal(solve.corrected(0 * counts, 0 * complete, exact), exact)  # every cell is too coarse
 
 
 def test_quantiles_are_those_of_numpy():
     rows = np.sort(np.random.default_rng(0).random((3, 17)).astype(np.float32), axis=1)
-    fractions, found = np.array([[0.0, 0.5, 0.3], [0.8, 1.0, 0.31]]), np.empty((2, 3))
-    kernels.quantiles(rows, fractions, found)
+    fractions = np.array([[0.0, 0.5, 0.3], [0.8, 1.0, 0.31]])
+    found = solve.quantiles(solve.Mixed(rows[None]), fractions[:, None])[:, 0]
     wanted = [[np.quantile(row.astype(float), at) for row, at in zip(rows, each, strict=True)] for each in fractions]
     assert found == pytest.approx(np.array(wanted), rel=1e-12)

@@ -249,7 +249,7 @@ def _summarised(scene: Scene, cells: Cells, slices: Slices, exact: Callable | No
     zones = [_zone(slices, at_edge) for at_edge in (False, True)] if scene.roll_width else []
     shares = [slices.share, slices.share, *zones]
     mixed = [*_mixed(pooled, shares[:1]), *_mixed(whole, shares[1:])]
-    percentiles = [_quantiles(one, _fractions(one.sizes.shape[:2])) for one in mixed]
+    percentiles = [quantiles(one, _fractions(one.sizes.shape[:2])) for one in mixed]
     below_floor = np.nextafter(scene.fragments.size_floor, 0.0)
     counts = _count(pooled, np.append(below_floor, march.cell_sieves(scene))[:, None])
     passing = counts / pooled.shape[-1]
@@ -259,7 +259,7 @@ def _summarised(scene: Scene, cells: Cells, slices: Slices, exact: Callable | No
         passing[..., 1:] = control.passing(counts[..., 1:], np.array(scene.resolution.sieves))
         for _ in range(2):  # the first read is off by the cells' own scatter, the second by little
             fractions = control.fractions(percentiles, shares)
-            percentiles = [_quantiles(one, at) for one, at in zip(mixed, fractions, strict=True)]
+            percentiles = [quantiles(one, at) for one, at in zip(mixed, fractions, strict=True)]
     by_run = np.ascontiguousarray(
         passing.swapaxes(0, 1)
     )  # each run's product of its own: their number leaves bits alone
@@ -342,16 +342,19 @@ def _mixed(cells: np.ndarray, shares: list[np.ndarray]) -> list[Mixed]:
     return found
 
 
-def _quantiles(mixed: Mixed, fractions: np.ndarray) -> np.ndarray:
+def quantiles(mixed: Mixed, fractions: np.ndarray) -> np.ndarray:
     """Return the quantiles at fractions (fraction, replicate, line).
 
     Of one slice linear between cells as np.quantile's are; of several the first size that reaches the fraction.
     """
-    found = np.empty_like(fractions)
     if mixed.reached is None:
-        of_rows = (part.reshape(len(fractions), -1) for part in (fractions, found))
-        kernels.quantiles(mixed.sizes.reshape(-1, mixed.sizes.shape[-1]), *of_rows)
-        return found
+        place = fractions * (mixed.sizes.shape[-1] - 1)
+        before = place.astype(int)
+        after = np.minimum(before + 1, mixed.sizes.shape[-1] - 1)
+        run, line = np.ogrid[: place.shape[1], : place.shape[2]]
+        low, high = (mixed.sizes[run, line, at].astype(float) for at in (before, after))
+        return low + (high - low) * (place - before)
+    found = np.empty_like(fractions)
     for k, line in np.ndindex(fractions.shape[1:]):
         places = np.searchsorted(mixed.reached[k, line], fractions[:, k, line])
         found[:, k, line] = mixed.sizes[k, line, places]
@@ -379,11 +382,8 @@ class Control(NamedTuple):
     def passing(self, counts: np.ndarray, sieves: np.ndarray) -> np.ndarray:
         """Return the passing (slice, replicate, streamline, sieve), given how many cells of the product pass."""
         complete = _count(self.complete, sieves.astype(np.float32).astype(float)[:, None])
-        exact, passing = np.empty((sieves.size, *counts.shape[:-1])), np.empty(counts.shape)
-        exact[:] = self.exact(size=sieves[:, None, None, None])
-        of_rows = (part.reshape(-1, sieves.size) for part in (counts, complete, passing))
-        kernels.correct_passing(*of_rows, exact.reshape(sieves.size, -1))
-        return passing
+        exact = np.broadcast_to(self.exact(size=sieves[:, None, None, None]), (sieves.size, *counts.shape[:-1]))
+        return corrected(counts, complete, np.moveaxis(exact, 0, -1))
 
     def fractions(self, sizes: list[np.ndarray], shares: list[np.ndarray]) -> list[np.ndarray]:
         """Return the fractions at which to read percentiles that are about sizes (fraction, replicate, line or 1)."""
@@ -391,10 +391,32 @@ class Control(NamedTuple):
         for k, about in enumerate(sizes):
             np.multiply(about[:, None], _ROUNDED, out=at[k])
         at = at.reshape(-1, *self.complete.shape[:-1])
-        exact = self.exact(size=at).reshape(len(at), -1)
-        counts = _count(self.complete, at.reshape(exact.shape)) / self.complete.shape[-1]
-        wanted = [_fractions(about.shape[1:]) for about in sizes]
-        for k, share in enumerate(shares):
-            first = k * len(FRACTIONS)
-            kernels.correct_fractions(counts.reshape(-1, len(at)), exact, first, share, wanted[k])
-        return wanted
+        counts = np.moveaxis(_count(self.complete, at.reshape(len(at), -1)), -1, 0) / self.complete.shape[-1]
+        exact, found = self.exact(size=at), []
+        for k, (about, share) in enumerate(zip(sizes, shares, strict=True)):
+            own = slice(k * len(FRACTIONS), (k + 1) * len(FRACTIONS))
+            counted, known = (_combined(part[own], share, about.shape[-1]) for part in (counts, exact))
+            wanted = _fractions(about.shape[1:])
+            np.divide(wanted * counted, known, out=wanted, where=known > 0)
+            found.append(np.maximum.accumulate(np.minimum(wanted, 1.0)))
+        return found
+
+
+def corrected(counts: np.ndarray, complete: np.ndarray, exact: np.ndarray) -> np.ndarray:
+    """Return the exact passing (..., sieve) times counts over those of the complete product, held rising.
+
+    Where no cell of the latter passes, the ratio is that of the next coarser sieve, 1 above all: 0 would be too little
+    in the mean.
+    """
+    ratio = np.divide(counts, complete, out=np.ones(counts.shape), where=complete > 0)
+    sieves = np.arange(counts.shape[-1])
+    known = np.maximum(sieves, np.minimum((complete == 0).sum(axis=-1, keepdims=True), sieves[-1]))
+    return np.maximum.accumulate(exact * np.take_along_axis(ratio, known, axis=-1), axis=-1)
+
+
+def _combined(passing: np.ndarray, share: np.ndarray, lines: int) -> np.ndarray:
+    """Return passing (fraction, slice, replicate, line) of all slices, and of all lines together where there is one."""
+    parts = share[:, None, None] * passing
+    if lines == 1:
+        parts = parts.swapaxes(2, 3).reshape(len(parts), -1, parts.shape[2], 1)
+    return np.cumsum(parts, axis=1)[:, -1]  # one after the other: np.sum's order depends on the number of replicates
