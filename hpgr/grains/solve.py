@@ -348,12 +348,14 @@ def quantiles(mixed: Mixed, fractions: np.ndarray) -> np.ndarray:
     Of one slice linear between cells as np.quantile's are; of several the first size that reaches the fraction.
     """
     if mixed.reached is None:
-        place = fractions * (mixed.sizes.shape[-1] - 1)
-        before = place.astype(int)
-        after = np.minimum(before + 1, mixed.sizes.shape[-1] - 1)
-        run, line = np.ogrid[: place.shape[1], : place.shape[2]]
-        low, high = (mixed.sizes[run, line, at].astype(float) for at in (before, after))
-        return low + (high - low) * (place - before)
+        rows = mixed.sizes.reshape(-1, mixed.sizes.shape[-1])
+        place = fractions.reshape(-1, len(rows)) * (rows.shape[1] - 1)
+        before, each = place.astype(int), np.arange(len(rows))
+        low, high = (
+            rows[each, before].astype(float),
+            rows[each, np.minimum(before + 1, rows.shape[1] - 1)].astype(float),
+        )
+        return (low + (high - low) * (place - before)).reshape(fractions.shape)
     found = np.empty_like(fractions)
     for k, line in np.ndindex(fractions.shape[1:]):
         places = np.searchsorted(mixed.reached[k, line], fractions[:, k, line])
@@ -383,7 +385,7 @@ class Control(NamedTuple):
         """Return the passing (slice, replicate, streamline, sieve), given how many cells of the product pass."""
         complete = _count(self.complete, sieves.astype(np.float32).astype(float)[:, None])
         exact = np.broadcast_to(self.exact(size=sieves[:, None, None, None]), (sieves.size, *counts.shape[:-1]))
-        return corrected(counts, complete, np.moveaxis(exact, 0, -1))
+        return corrected(counts, complete, exact.transpose(1, 2, 3, 0))
 
     def fractions(self, sizes: list[np.ndarray], shares: list[np.ndarray]) -> list[np.ndarray]:
         """Return the fractions at which to read percentiles that are about sizes (fraction, replicate, line or 1)."""
@@ -391,11 +393,16 @@ class Control(NamedTuple):
         for k, about in enumerate(sizes):
             np.multiply(about[:, None], _ROUNDED, out=at[k])
         at = at.reshape(-1, *self.complete.shape[:-1])
-        counts = np.moveaxis(_count(self.complete, at.reshape(len(at), -1)), -1, 0) / self.complete.shape[-1]
-        exact, found = self.exact(size=at), []
+        passing, found = np.empty((2, *at.shape)), []
+        passing[0] = _count(self.complete, at.reshape(len(at), -1)).transpose(3, 0, 1, 2)
+        passing[0] /= self.complete.shape[-1]
+        passing[1] = self.exact(size=at)
         for k, (about, share) in enumerate(zip(sizes, shares, strict=True)):
-            own = slice(k * len(FRACTIONS), (k + 1) * len(FRACTIONS))
-            counted, known = (_combined(part[own], share, about.shape[-1]) for part in (counts, exact))
+            parts = share[:, None, None] * passing[:, k * len(FRACTIONS) : (k + 1) * len(FRACTIONS)]
+            if about.shape[-1] == 1:  # all lines together
+                parts = parts.swapaxes(3, 4).reshape(*parts.shape[:2], -1, parts.shape[3], 1)
+            # one after the other: the order of np.sum depends on the number of replicates
+            counted, known = parts.cumsum(axis=2)[:, :, -1]
             wanted = _fractions(about.shape[1:])
             np.divide(wanted * counted, known, out=wanted, where=known > 0)
             found.append(np.maximum.accumulate(np.minimum(wanted, 1.0)))
@@ -412,11 +419,3 @@ def corrected(counts: np.ndarray, complete: np.ndarray, exact: np.ndarray) -> np
     sieves = np.arange(counts.shape[-1])
     known = np.maximum(sieves, np.minimum((complete == 0).sum(axis=-1, keepdims=True), sieves[-1]))
     return np.maximum.accumulate(exact * np.take_along_axis(ratio, known, axis=-1), axis=-1)
-
-
-def _combined(passing: np.ndarray, share: np.ndarray, lines: int) -> np.ndarray:
-    """Return passing (fraction, slice, replicate, line) of all slices, and of all lines together where there is one."""
-    parts = share[:, None, None] * passing
-    if lines == 1:
-        parts = parts.swapaxes(2, 3).reshape(len(parts), -1, parts.shape[2], 1)
-    return np.cumsum(parts, axis=1)[:, -1]  # one after the other: np.sum's order depends on the number of replicates
