@@ -33,17 +33,10 @@ class Result(NamedTuple):
 
 
 def load(scene: Scene, beds: Beds | None = None) -> tuple[Scene, LoadedBed]:
-    """Return `scene` with the gap that carries its pressing force, and the bed loaded there.
+    """Return `scene` with the gap that carries its pressing force, or its own if it has none, and the bed loaded there.
 
-    ValueError if no gap carries the pressing force, or material points coincide.
-
-    Parameters
-    ----------
-    scene : Scene
-        What is simulated; its gap is kept if it has no specific pressing force.
-    beds : Beds, optional
-        Loaded beds to be shared by scenes that differ in the ore's strength, fragments or cells alone; default: the
-        bed of the last call, if it is small.
+    `beds` are shared by scenes that differ in the ore's strength, fragments or cells alone; default: the bed of the
+    last call, if it is small. ValueError if no gap carries the pressing force, or material points coincide.
     """
     scene = machine.float_gap(scene)
     inputs = inputs_of(scene, tessellated=solve.choose(scene).endswith("lattice"))

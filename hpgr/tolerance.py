@@ -51,23 +51,12 @@ class Estimate(NamedTuple):
 
 
 def refine(scene: Scene, tolerance: float, run: Run, max_cost: float = 60.0, seed: int = 0) -> Estimate:
-    """Return the resolution at which the estimated error of `scene` is within `tolerance`.
+    """Return the resolution at which the estimated error of `scene` is within `tolerance`, 1e-4 to 0.5, relative.
 
-    ValueError if the tolerance is out of range, or cannot be met under `max_cost`; the message has the predicted cost.
-
-    Parameters
-    ----------
-    scene : Scene
-        What is simulated; its streamlines are the fewest taken, its points and cells are chosen anew. More than
-        one snapshot makes the noise smaller than estimated.
-    tolerance : float
-        Wanted relative error of P80, fraction below 1 mm and peak pressure; from 1e-4 to 0.5.
-    run : callable
-        `hpgr.run.run_scene`, which this module lies below.
-    max_cost : float
-        Predicted seconds that pilot and final run may take together.
-    seed : int
-        Seed of the pilot runs.
+    The scene's streamlines are the fewest taken, its points and cells are chosen anew; more than one snapshot makes the
+    noise smaller than estimated. `run` is `hpgr.run.run_scene`, which this module lies below; `max_cost` the predicted
+    seconds that pilot and final run may take together. ValueError if the tolerance is out of range, or cannot be met
+    under `max_cost`; the message has the predicted cost.
     """
     check_number("tolerance", tolerance)
     spent = _Purse(run, tolerance, max_cost)

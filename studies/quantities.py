@@ -14,24 +14,12 @@ _PASSING = "passing"
 
 
 class Quantity(NamedTuple):
-    """A figure of a run.
+    """A figure of a run."""
 
-    Attributes
-    ----------
-    variable : str
-        Variable that it is, or is part of.
-    unit : str
-        SI.
-    words : str
-        What it is called, by which `quantity_of` finds it.
-    sieve : float, optional
-        Sieve, m, of a mass fraction passing.
-    """
-
-    variable: str
-    unit: str
-    words: str
-    sieve: float | None = None
+    variable: str  # that it is, or is part of
+    unit: str  # SI
+    words: str  # what it is called, by which `quantity_of` finds it
+    sieve: float | None = None  # m, of a mass fraction passing
 
     @property
     def of_product(self) -> bool:

@@ -46,22 +46,9 @@ class Options(line.Common):
 def indices(function: Callable[[np.ndarray], np.ndarray], fields: int, count: int, seed: int = 0) -> np.ndarray:
     """Return Sobol indices of the figures of a function on the unit cube, with bootstrapped 95 % intervals.
 
-    Parameters
-    ----------
-    function : callable
-        Takes points (point, field) within 0 to 1; returns figures (figure, point).
-    fields : int
-        Number of fields.
-    count : int
-        Points of each of the two designs that are crossed, a power of two.
-    seed : int
-        Of the design and of the bootstrap.
-
-    Returns
-    -------
-    ndarray
-        (order, estimate, figure, field): first order and total; value, low and high. NaN where a figure is the same
-        everywhere.
+    The function takes points (point, field) within 0 to 1 and returns figures (figure, point); two designs of `count`
+    points each, a power of two, are crossed. Indices are (order, estimate, figure, field): first order and total;
+    value, low and high. NaN where a figure is the same everywhere.
     """
     both = sobol_points(2 * fields, count, seed)
     one, other = both[:, :fields], both[:, fields:]

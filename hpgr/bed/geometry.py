@@ -11,28 +11,14 @@ import numpy as np
 
 
 class Geometry(NamedTuple):
-    """Outermost streamline X(y) = half_gap + b y**2 + c y**3 and the labels of the computed ones.
+    """Outermost streamline X(y) = half_gap + b y**2 + c y**3 and the labels of the computed ones."""
 
-    Attributes
-    ----------
-    half_gap : float
-        Half the minimum gap, m.
-    height : float
-        Height H of the bed above the minimum gap, m; 0 if gap and entry gap are equal.
-    b, c : float
-        Coefficients of the cubic, 1/m and 1/m2.
-    radius : float
-        Roll radius, m.
-    xi : ndarray
-        (streamline,) centres of the stream tubes as fractions of the outermost streamline.
-    """
-
-    half_gap: float
-    height: float
-    b: float
-    c: float
-    radius: float
-    xi: np.ndarray
+    half_gap: float  # half the minimum gap, m
+    height: float  # H of the bed above the minimum gap, m; 0 if gap and entry gap are equal
+    b: float  # coefficients of the cubic, 1/m
+    c: float  # and 1/m2
+    radius: float  # of the rolls, m
+    xi: np.ndarray  # (streamline,) centres of the stream tubes as fractions of the outermost streamline
 
     def outer(self, y):
         """Return X(y), the half width of the bed at height y, m."""

@@ -16,34 +16,19 @@ _CLOSEST = 1e-9  # spacing of points, as a fraction of the bed's height, below w
 class Kinematics(NamedTuple):
     """Material points and how the bed deforms there; arrays are (streamline, point), entry to exit.
 
-    Attributes
-    ----------
-    x, y : ndarray
-        Distance from the mid-plane and height above the minimum gap, m.
-    residence_time : ndarray
-        (point,) time since the first point, s; the same on every streamline.
-    speed : ndarray
-        Speed along the streamline, m/s.
-    volumetric_rate, shear_rate : ndarray
-        Rates of volumetric (compaction positive) and triaxial shear strain, 1/s.
-    across : ndarray
-        Normal to the streamline, the deviator of the strain rate over the shear rate: 1 in uniaxial compaction.
-        With stress and strain rate coaxial the normal stress on the streamline is p + 2 q / 3 times this.
-    flux : ndarray
-        X |v_y|, the area that sinks per time at this height between mid-plane and roll at the speed here, m2/s.
-    time_step : float
-        Time between neighbouring points, s.
+    `across` is, normal to the streamline, the deviator of the strain rate over the shear rate: 1 in uniaxial
+    compaction. With stress and strain rate coaxial the normal stress on the streamline is p + 2 q / 3 times this.
     """
 
-    x: np.ndarray
-    y: np.ndarray
-    residence_time: np.ndarray
-    speed: np.ndarray
-    volumetric_rate: np.ndarray
-    shear_rate: np.ndarray
+    x: np.ndarray  # distance from the mid-plane, m
+    y: np.ndarray  # height above the minimum gap, m
+    residence_time: np.ndarray  # (point,) since the first point, s; the same on every streamline
+    speed: np.ndarray  # along the streamline, m/s
+    volumetric_rate: np.ndarray  # of strain, 1/s; compaction positive
+    shear_rate: np.ndarray  # of triaxial shear strain, 1/s
     across: np.ndarray
-    flux: np.ndarray
-    time_step: float
+    flux: np.ndarray  # X |v_y|, area that sinks per time here between mid-plane and roll at the speed here, m2/s
+    time_step: float  # between neighbouring points, s
 
 
 class StepStrains(NamedTuple):

@@ -71,21 +71,11 @@ def inputs_of(scene: Scene, tessellated: bool = False) -> BedInputs:
 
 
 class Pressed(NamedTuple):
-    """What presses and drives the bed, per metre of roll width.
+    """What presses and drives the bed, per metre of roll width."""
 
-    Attributes
-    ----------
-    force : float
-        Pressing force per width, N/m.
-    power : float
-        Work done on the bed per width and time, both halves of the gap, W/m.
-    nip_angle : float
-        Angle at which compaction begins at the roll, rad; 0 if it never does.
-    """
-
-    force: float
-    power: float
-    nip_angle: float
+    force: float  # pressing force per width, N/m
+    power: float  # work done on the bed per width and time, both halves of the gap, W/m
+    nip_angle: float  # at which compaction begins at the roll, rad; 0 if it never does
 
 
 class LoadedBed(NamedTuple):

@@ -12,32 +12,16 @@ _TENSION_NOISE = 1e-9  # of the largest stress; less is rounding of the running 
 
 
 class StressState(NamedTuple):
-    """State of the bed at the material points; arrays are (streamline, point).
+    """State of the bed at the material points; arrays are (streamline, point)."""
 
-    Attributes
-    ----------
-    volumetric_strain, shear_strain : ndarray
-        Volumetric and elastic triaxial shear strain since the onset of compaction.
-    solid_fraction : ndarray
-        Solid fraction, at most the bed's maximum.
-    pressure, shear_stress : ndarray
-        Mean stress p and triaxial shear stress q, Pa.
-    on_shear_limit : ndarray of bool
-        Whether shear beyond the convexity limit has been taken as plastic here.
-    continuity_solid_fraction : ndarray
-        (streamline,) solid fraction that mass continuity would need at the exit; may exceed 1.
-    tension_clamped : bool
-        Whether the law asked for tension, or for shear against the flow, somewhere: stresses are held at 0 then.
-    """
-
-    volumetric_strain: np.ndarray
-    shear_strain: np.ndarray
-    solid_fraction: np.ndarray
-    pressure: np.ndarray
-    shear_stress: np.ndarray
-    on_shear_limit: np.ndarray
-    continuity_solid_fraction: np.ndarray
-    tension_clamped: bool
+    volumetric_strain: np.ndarray  # since the onset of compaction
+    shear_strain: np.ndarray  # elastic, triaxial, since then
+    solid_fraction: np.ndarray  # at most the bed's maximum
+    pressure: np.ndarray  # mean stress p, Pa
+    shear_stress: np.ndarray  # triaxial, q, Pa
+    on_shear_limit: np.ndarray  # of bool, whether shear beyond the convexity limit has been taken as plastic here
+    continuity_solid_fraction: np.ndarray  # (streamline,) that mass continuity would need at the exit; may exceed 1
+    tension_clamped: bool  # whether tension, or shear against the flow, was asked for somewhere: stresses are then 0
 
 
 def load(

@@ -15,33 +15,15 @@ _CLOSED = 1e-9  # of the domain's area, to which the cells must sum
 
 
 class Tessellation(NamedTuple):
-    """Voronoi cells of the material points, numbered streamline by streamline, entry to exit.
+    """Voronoi cells of the material points, numbered streamline by streamline, entry to exit."""
 
-    Attributes
-    ----------
-    volume : ndarray
-        (streamline, point) area of each cell, m2: volume per unit roll width.
-    pairs : ndarray
-        (edge, 2) numbers of the two points an edge lies between, the lower point first.
-    length : ndarray
-        (edge,) length of the edge within the bed, m.
-    normal : ndarray
-        (edge, 2) unit normal from the first to the second point; its y is never negative.
-    distance : ndarray
-        (edge,) distance between the two points, m.
-    cells : ndarray of shapely.Polygon
-        (streamline x point,) the cells themselves.
-    domain : shapely.Polygon
-        The bed: mid-plane, outermost streamline, entry and exit rows.
-    """
-
-    volume: np.ndarray
-    pairs: np.ndarray
-    length: np.ndarray
-    normal: np.ndarray
-    distance: np.ndarray
-    cells: np.ndarray
-    domain: shapely.Polygon
+    volume: np.ndarray  # (streamline, point) area of each cell, m2: volume per unit roll width
+    pairs: np.ndarray  # (edge, 2) numbers of the two points an edge lies between, the lower point first
+    length: np.ndarray  # (edge,) length of the edge within the bed, m
+    normal: np.ndarray  # (edge, 2) unit normal from the first to the second point; its y is never negative
+    distance: np.ndarray  # (edge,) between the two points, m
+    cells: np.ndarray  # (streamline x point,) of shapely.Polygon
+    domain: shapely.Polygon  # the bed: mid-plane, outermost streamline, entry and exit rows
 
 
 def tessellate(geometry: Geometry, x: np.ndarray, y: np.ndarray, rim: np.ndarray) -> Tessellation:

@@ -176,14 +176,7 @@ def _version(library: str) -> str:
 def to_dataset(values: Mapping[str, Any], attrs: Mapping[str, Any], own: Mapping[str, Variable] = {}) -> xr.Dataset:
     """Return arrays by name as a labelled Dataset, None left out; KeyError if a name is in no table.
 
-    Parameters
-    ----------
-    values : Mapping
-        Arrays by name.
-    attrs : Mapping
-        Attributes of the Dataset.
-    own : Mapping, optional
-        Variables of a study that no simulation has; one along a dimension of its own name is a coordinate.
+    `own` has the variables of a study that no simulation has; one along a dimension of its own name is a coordinate.
     """
     table = {**COORDINATES, **VARIABLES, **SWEEP, **own}
     given = {name: value for name, value in values.items() if value is not None}

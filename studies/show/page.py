@@ -305,16 +305,9 @@ def said(point: xr.Dataset) -> list[list]:
 
 
 def page_of(data: dict[str, Any], library: str, history: str = "") -> str:
-    """Return the page as text.
+    """Return the page as text, from `page_data`, the source of plotly.js and the command that made it.
 
-    Parameters
-    ----------
-    data : dict
-        From `page_data`.
-    library : str
-        Source of plotly.js, which is packed to two fifths of its size; browsers since 2023 unpack it.
-    history : str
-        The command that made it.
+    The library is packed to two fifths of its size; browsers since 2023 unpack it.
 
     Examples
     --------

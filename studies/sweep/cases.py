@@ -271,14 +271,10 @@ class Driver(NamedTuple):
 
 
 class CaseFolder:
-    """A folder of finished cases that this driver reads and adds to; OSError if it cannot be written to.
+    """A folder of finished cases that this driver reads and adds to, made if it is not there.
 
-    Parameters
-    ----------
-    folder : Path
-        Made if it is not there.
-    recompute : bool
-        Whether to pass over what is in it already, so that everything is computed again.
+    With `recompute` what is in it already is passed over, so that everything is computed again. OSError if it cannot be
+    written to.
     """
 
     def __init__(self, folder: str | Path, recompute: bool = False):

@@ -31,28 +31,14 @@ _TAKEN = {"time", "snapshot", "streamline", "point", "cell", "sieve", "slice", "
 
 
 class SweepSpec(NamedTuple):
-    """What all cases of a sweep have in common.
+    """What all cases of a sweep have in common; `tolerance` and `max_cost` as in `hpgr.simulate`."""
 
-    Attributes
-    ----------
-    base : Scene
-        Base scene; its `resolution.record` decides whether cases are told whole or in summary.
-    seed : int
-        Seed of all randomness.
-    tolerance, max_cost : float
-        As in `hpgr.simulate`.
-    timeout : float or None
-        Seconds that a case may take; cases then run in processes of their own (`studies.sweep.isolated`).
-    code : str
-        `studies.sweep.cases.code_version` of the driver; a worker with other code refuses to work.
-    """
-
-    base: Scene
-    seed: int = 0
+    base: Scene  # whose `resolution.record` decides whether cases are told whole or in summary
+    seed: int = 0  # of all randomness
     tolerance: float | None = None
     max_cost: float = 60.0
-    timeout: float | None = None
-    code: str = ""
+    timeout: float | None = None  # s that a case may take; each then runs in a process (`studies.sweep.isolated`)
+    code: str = ""  # `studies.sweep.cases.code_version` of the driver; a worker with other code refuses to work
 
     @property
     def whole(self) -> bool:
@@ -85,18 +71,11 @@ class CaseResult(NamedTuple):
 
 
 class Axis(NamedTuple):
-    """A dimension of a sweep.
+    """A dimension of a sweep."""
 
-    Attributes
-    ----------
-    places : list of dict
-        What is changed in the scene at each place along it, by dotted name; of a named scene, every section.
-    labels : list, optional
-        What the places are called, where no field gives the dimension its name.
-    """
-
+    # what is changed in the scene at each place along it, by dotted name; of a named scene, every section
     places: list[dict[str, Any]]
-    labels: list | None = None
+    labels: list | None = None  # what the places are called, where no field gives the dimension its name
 
     @property
     def fields(self) -> list[str]:
@@ -212,14 +191,9 @@ class _Column(NamedTuple):
 
 
 def axes_of(space: "Mapping[Any, Any] | xr.Dataset") -> dict[str, Axis]:
-    """Return the axes of a space, their values in SI, refusing what no scene could take.
+    """Return the axes of a space, as `studies.sweep.sweep` takes it, their values in SI.
 
-    ValueError naming the field, the value and the remedy.
-
-    Parameters
-    ----------
-    space : mapping or xarray.Dataset
-        As `studies.sweep.sweep` takes it.
+    What no scene could take is refused by a ValueError that names the field, the value and the remedy.
     """
     if not isinstance(space, Mapping):
         raise ValueError(

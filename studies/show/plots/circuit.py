@@ -16,13 +16,7 @@ _STREAMS = {
 
 
 def circuit_figure(result: xr.Dataset) -> Figure:
-    """Return the distributions of the first operating point with a steady state, and load and energy of every one.
-
-    Parameters
-    ----------
-    result : xarray.Dataset
-        From `studies.circuit.close_circuit`.
-    """
+    """Return the distributions of the first operating point with a steady state, and load and energy of every one."""
     points = report.operating_points(result)
     held = np.flatnonzero(points["circulating_load"].notnull().any("replicate").values)
     figure = Figure(figsize=(11, 4.6), layout="constrained")

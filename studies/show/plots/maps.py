@@ -22,16 +22,8 @@ def is_map(result: xr.Dataset) -> bool:
 
 
 def maps_figure(result: xr.Dataset, sieve: float, caption: str) -> Figure:
-    """Return four maps over both axes of a sweep; operating points of an unusual machine are hatched.
-
-    Parameters
-    ----------
-    result : xarray.Dataset
-        From `studies.sweep.sweep`, as `is_map` wants it.
-    sieve : float
-        Sieve in m whose percent passing is shown.
-    caption : str
-        Sentences under the figure.
+    """Return four maps over both axes of a sweep, as `is_map` wants it; operating points of an unusual machine are
+    hatched, and the percent passing of the sieve (m) is shown.
     """
     known = report.figures(result, sieve)
     below = [heading for heading in known if heading.startswith("below")]

@@ -11,13 +11,7 @@ _LINES = ("-", "--", "-.", ":")
 
 
 def pilot_figure(result: xr.Dataset) -> Figure:
-    """Return a panel of size distributions per test, and one of errors of throughput, power and energy.
-
-    Parameters
-    ----------
-    result : xarray.Dataset
-        From `studies.pilot.assemble`.
-    """
+    """Return a panel of size distributions per test of `studies.pilot.assemble`, and one of errors of figures."""
     tests, sources = result["test"].values, list(result["source"].values[1:])
     columns = min(3, tests.size + 1)
     rows = -(-(tests.size + 1) // columns)

@@ -7,13 +7,7 @@ from matplotlib.figure import Figure
 
 
 def sensitivity_figure(result: xr.Dataset) -> Figure:
-    """Return bars of first-order and total indices with their intervals; hatched: total.
-
-    Parameters
-    ----------
-    result : xarray.Dataset
-        From `studies.sensitivity.sensitivity`.
-    """
+    """Return bars of first-order and total indices with their intervals; hatched: total."""
     names, fields = result["figure"].values, result["field"].values
     figure = Figure(figsize=(3 + 2.6 * names.size, 1.6 + 0.55 * fields.size), layout="constrained")
     for panel, name in zip(figure.subplots(1, names.size, sharey=True, squeeze=False)[0], names, strict=True):

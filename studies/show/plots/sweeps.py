@@ -21,18 +21,9 @@ _DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (7, 2
 
 
 def sweep_figure(result: xr.Dataset, field: str, sieve: float, caption: str) -> Figure:
-    """Return the figure of a sweep: fineness across the gap, product sizes, and figures against the axis.
+    """Return the figure of a sweep: fineness across the gap, product sizes, and figures against the axis of a field.
 
-    Parameters
-    ----------
-    result : xarray.Dataset
-        From `studies.sweep.sweep`.
-    field : str
-        Scene field of the main axis, such as "rolls.gap".
-    sieve : float
-        Sieve in m whose percent passing is shown.
-    caption : str
-        Sentence under the figure.
+    The percent passing of the sieve (m) is shown; the caption is a sentence under the figure.
     """
     along = (axis for dim in report.axes_of(result) for axis in report.swept(result, dim))
     axis = next(axis for axis in along if axis.attrs.get("scene_field") == field)
