@@ -7,6 +7,7 @@ it, among unbroken feed, the mean field of the same swaps is exact in the limit 
 import math
 from collections.abc import Callable
 from functools import partial
+from itertools import cycle
 from typing import NamedTuple
 
 import numpy as np
@@ -106,11 +107,9 @@ def substeps_needed(rates: SwapRates, mixing: np.ndarray, means: np.ndarray, lar
     largest : float
         Size of the largest grain anywhere, m.
     """
-    lower, upper = rates.pairs.T
-    most = mixing + rates.rise * (np.maximum(largest - means[lower], 0) + means[upper])
-    sums = np.bincount(lower, most, means.size) + np.bincount(upper, most, means.size)
-    needed = np.maximum(np.ceil(sums / LARGEST_SUM), 1.0)
-    return np.maximum(needed[lower], needed[upper]).astype(np.int64)
+    substeps = np.empty(mixing.size, np.int64)
+    kernels.split(rates.pairs, rates.rise, mixing, means, largest, LARGEST_SUM, np.zeros(means.size), substeps)
+    return substeps
 
 
 def refuse_substeps(scene: Scene, rates: SwapRates, substeps: int) -> None:
@@ -132,8 +131,8 @@ def edges_of(scene: Scene, rates: SwapRates, means: np.ndarray) -> tuple[Edges, 
     substeps = substeps_needed(rates, mixing, means, scene.feed.largest_grain)
     most = int(substeps.max(initial=1))
     refuse_substeps(scene, rates, most)
-    had = np.arange(most + 1)[:, None] * np.arange(most + 1) // most  # turns so far, of so many; evenly spread
-    turns = np.nonzero((np.diff(had, axis=0) > 0)[:, substeps])[1]
+    turns = np.empty(substeps.sum(), np.int64)
+    kernels.take_turns(substeps, most, np.zeros_like(substeps), turns)
     return Edges(rates.pairs, rates.rise / substeps, mixing / substeps, rates.ceiling, turns), most
 
 
@@ -164,7 +163,7 @@ class Lattice:
     cores : Cores
         What the work is shared between.
     entering : callable, optional
-        Quantile function (streamline, ...) of what enters; the feed's if not given.
+        Quantile function of what enters, for rows of fractions of each streamline in turn; the feed's if not given.
 
     Attributes
     ----------
@@ -193,6 +192,8 @@ class Lattice:
         self._breaking = can_break(scene, self._path).ravel()
         cells, scattered = scene.resolution.cells, math.isfinite(scene.strength.scatter)
         self.parcels = kernels.make_parcels(log_stress.size, cells, scattered)
+        self._shares = kernels.make_shares(log_stress.size, cells, _SHARE, scattered)
+        self._per_size = np.float32(2.0**30 / scene.feed.largest_grain)  # parts in which sizes are summed, to 1e-9
         self._works = [kernels.make_work(cells) for _ in range(cores.count)]
         self._home = np.arange(log_stress.size).reshape(log_stress.shape)
         self.slots = self._home
@@ -210,12 +211,14 @@ class Lattice:
         self._crush(slots, lines, points, points + 1)
         self._swap(step)
 
-    def sizes(self) -> np.ndarray:
-        """Return the sizes of all cells, (streamline, point, cell), m."""
-        return self.parcels.sizes[self.slots, 1:-1]
+    def sizes(self, slots: np.ndarray) -> np.ndarray:
+        """Return the sizes of all cells in these slots, (..., cell), m."""
+        kernels.gather(self._shares, slots.ravel(), self.parcels)
+        return self.parcels.sizes[slots, 1:-1]
 
     def classes(self, sieves: np.ndarray) -> np.ndarray:
         """Return the cells of each sieve class, (streamline, point, sieve + 1)."""
+        kernels.gather(self._shares, self.slots.ravel(), self.parcels)
         counts = np.empty((self.slots.size, sieves.size + 1), np.int64)
         for place, slot in enumerate(self.slots.ravel()):
             kernels.classify(self.parcels.sizes, slot, sieves, place, counts)
@@ -227,50 +230,56 @@ class Lattice:
 
         def crush(work, part):
             passage = Passage(*(np.ascontiguousarray(each[part]) for each in (slots, lines, first, last)))
+            kernels.gather(self._shares, passage.slots, self.parcels)
             kernels.crush(self.parcels, passage, self._path, self._ore, work, Record())
+            kernels.spread(self.parcels, passage.slots, self._shares, self._per_size)
 
         list(self._each(crush, self._works, parts))
 
     def _let_in(self, step: int) -> None:
         """Put new parcels in the first points; at the first fill as the bed would have brought them there."""
-        for point, slots in enumerate(self.slots[:, :1].T if step else self.slots.T):
-            keys = [self._key(line, step - point) for line in range(slots.size)]
-            fresh = march.first_cells(self._scene, self._seed, keys, self._entering)
+        slots = self.slots if step == 0 else self.slots[:, :1]
+        at_once = max(march.AT_ONCE // (len(slots) * self._scene.resolution.cells), 1)
+        for first in range(0, slots.shape[1], at_once):
+            part = slots[:, first : first + at_once].T
+            bases = [self._bases(step - first - point) for point in range(len(part))]
+            fresh = march.first_cells(self._scene, np.concatenate(bases), self._entering)
             for mine, new in zip(self.parcels, fresh, strict=True):
                 if mine is not None:
-                    mine[slots] = new
+                    mine[part.ravel()] = new
+        kernels.spread(self.parcels, slots.ravel(), self._shares, self._per_size)
         if step == 0 and self._scene.exchange.start == "crushed":
             lines, points = np.divmod(np.arange(self.slots.size), self.slots.shape[1])
             self._crush(self.slots.ravel(), lines, 0 * points, points)
 
-    def _key(self, line: int, entered: int) -> tuple[int, ...]:
-        """Return the random key of the parcel that entered a streamline at a step, which may lie before the first."""
-        last = self._home.shape[1] - 1
-        snapshot = self._steady.get(entered + last)
+    def _bases(self, entered: int) -> np.ndarray:
+        """Return the bases of the streams of what entered all streamlines at a step, which may lie before the first."""
+        lines, points = self._home.shape
+        snapshot = self._steady.get(entered + points - 1)
         if snapshot is not None:
-            return self._replicate, line, snapshot
+            return march.bases(self._seed, [(self._replicate, line, snapshot) for line in range(lines)])
         # a fourth number keeps other parcels apart from those that share their key with the march
-        return self._replicate, line, 0, 1 + entered + last
+        source = np.random.SeedSequence(self._seed, spawn_key=(self._replicate, 0, 0, entered + points))
+        return source.generate_state(2 * lines, np.uint64).reshape(lines, 2)
 
     def _swap(self, step: int) -> None:
         """Swap cells across all edges, in as many substeps as keep the probabilities of a cell at 1/2."""
         slots, cells = self.slots.ravel(), self._scene.resolution.cells
-        means = np.empty(slots.size)
-        largest = self._scene.feed.largest_grain
-        kernels.measure(self.parcels.sizes, slots, largest, means)
+        totals = self._shares.totals.sum(axis=0)[slots]
+        means = (totals + 0.5 * cells) / (float(self._per_size) * cells)
         edges, most = edges_of(self._scene, self._rates, means)
         self.most_substeps = max(self.most_substeps, most)
+        largest, per_size = self._scene.feed.largest_grain, self._per_size
         key = np.uint64(kernels.mix(np.uint64((self._swap_key + (step + 1) * 0xD1342543DE82EF95) % 2**64)))
 
-        def swap(first, last):
+        def swap(part):
+            places = min(_SHARE, cells - part * _SHARE)
             numbers = np.empty(_SHARE // 4 + 1, np.uint64)
             hits = None if self.parcels.weakness is None else np.empty(_SHARE, bool)
-            work = numbers, numbers.view(np.uint16), hits
-            return kernels.swap(self.parcels, slots, edges, means, largest, key, first, last, _SHARE, *work)
+            how = means, largest, per_size, key, numbers, numbers.view(np.uint16), hits
+            return kernels.swap(self._shares, part, places, slots, edges, *how)
 
-        shares = np.array_split(np.arange(1, cells + 1, _SHARE), len(self._works))
-        ends = [(int(part[0]), min(int(part[-1]) + _SHARE, cells + 1)) for part in shares if part.size]
-        self.swaps += sum(self._each(swap, *zip(*ends, strict=True)))
+        self.swaps += sum(self._each(swap, range(self._shares.totals.shape[0])))
 
 
 class Above(NamedTuple):
@@ -359,12 +368,12 @@ def run(
             if step not in steps:
                 continue
             if grid.record == "cells":
-                sizes.append(lattice.sizes())
+                sizes.append(lattice.sizes(lattice.slots))
             if grid.record == "distributions":
                 classes.append(lattice.classes(sieves))
             if step >= last:
                 at_exit = lattice.slots[:, -1]
-                product.append(lattice.parcels.sizes[at_exit, 1:-1])
+                product.append(lattice.sizes(at_exit))
                 breaks += lattice.parcels.breaks[at_exit]
     # as of the whole lattice, which goes on for `first` more steps; a start-up of feed swaps more often
     swaps += (lattice.swaps + first * (lattice.swaps - before)) / grid.cells / (steps[-1] + 1 + first)
@@ -379,8 +388,8 @@ def run(
 
 
 def _quantile_of(scene: Scene, shares: np.ndarray) -> Callable:
-    """Return the quantile function (streamline, ...) of mixtures (streamline, class) of the feed's classes."""
+    """Return the quantile function of mixtures (streamline, class) of the feed's classes, for rows of each in turn."""
     passing = np.pad(np.cumsum(shares, axis=1), ((0, 0), (1, 0)))
     feed = np.linspace(0, 1, passing.shape[1])
     mixed = [partial(np.interp, xp=each / each[-1], fp=feed) for each in passing]
-    return lambda fraction: scene.feed.quantile(np.stack([one(row) for one, row in zip(mixed, fraction, strict=True)]))
+    return lambda rows: scene.feed.quantile(np.stack([one(row) for one, row in zip(cycle(mixed), rows)]))
