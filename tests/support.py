@@ -170,18 +170,19 @@ def draw(feed, cells, source):
     """Sizes of a parcel as the package draws them, from a SeedSequence."""
     uniforms = np.empty((1, cells))
     bases = source.generate_state(2, np.uint64)[None]
-    kernels.start_parcels(bases, ore(laws()), uniforms, np.empty((1, cells + 2), np.uint64), None)
+    kernels.start_parcels(bases, ore(laws()), np.zeros(1, int), uniforms, np.empty((1, cells + 2), np.uint64), None)
     return feed.quantile(uniforms[0]).astype(np.float32)
 
 
-def first_cells(scene, seed, key):
-    """The cells of a parcel of feed, as the model page has it: every bit keyed by seed and key.
+def first_cells(scene, seed, key, line=0):
+    """The cells of a parcel of feed, as the model page has it: every bit keyed by seed and key; some keys have lines.
 
     Written out here in plain Python, so that the product of a scene in which nothing breaks is compared with
     something else.
     """
     cells = scene.resolution.cells
-    base, state = (int(one) for one in np.random.SeedSequence(seed, spawn_key=key).generate_state(2, np.uint64))
+    numbers = np.random.SeedSequence(seed, spawn_key=key).generate_state(2 * line + 2, np.uint64)
+    base, state = (int(one) for one in numbers[-2:])
     streams = [split_mix(base + (p + 1) * GOLDEN) for p in range(cells)]
     numbers = ((split_mix(state + k * GOLDEN) >> 12) + 0.5 for k in range(1, 2 * cells))
     order = list(range(cells))

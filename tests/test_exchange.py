@@ -249,12 +249,12 @@ class Column:
     Strengths scatter, and each grain's own is a number of its own, by which it is known.
     """
 
-    def __init__(self, sizes, pairs=None, rise=0.0, mixing=0.0, means=None, seed=0, ceiling=0.0):
+    def __init__(self, sizes, pairs=None, rise=0.0, mixing=0.0, means=None, seed=0, ceiling=0.0, shares=1):
         sizes = np.array(sizes, np.float32)
         points, cells = sizes.shape
-        self.parcels = kernels.make_parcels(points, cells, scattered=True)
-        self.sizes, self.marks = self.parcels.sizes[:, 1:-1], self.parcels.weakness[:, 1:-1]
-        self.sizes[:], self.marks[:] = sizes, np.arange(points * cells).reshape(points, cells)
+        self.shares = kernels.make_shares(points, cells, -(-cells // shares), scattered=True)
+        for mine, values in zip(self.shares[:2], (sizes, np.arange(points * cells)), strict=True):
+            mine[:] = values.reshape(points, shares, -1).swapaxes(0, 1)
         self.slots = np.arange(points)
         self.pairs = np.array([(k, k + 1) for k in range(points - 1)] if pairs is None else pairs)
         rates = (np.broadcast_to(rate, len(self.pairs)).astype(float) for rate in (rise, mixing, ceiling))
@@ -262,18 +262,28 @@ class Column:
         self.means = sizes.mean(axis=1, dtype=float) if means is None else np.broadcast_to(means, points).copy()
         self.keys = (np.uint64(split_mix((seed << 32) + number * GOLDEN)) for number in itertools.count())
 
-    def swap(self, times=1, shares=1):
-        """Return the number of swaps of `times` substeps, the places in equal shares."""
-        swaps, cells = 0, self.sizes.shape[1]
+    @property
+    def sizes(self):
+        """Sizes (point, cell)."""
+        return np.concatenate(self.shares.sizes, axis=1)
+
+    @property
+    def marks(self):
+        """Numbers of the grains (point, cell)."""
+        return np.concatenate(self.shares.weakness, axis=1)
+
+    def swap(self, times=1, order=1):
+        """Return the number of swaps of `times` substeps, the shares in this order."""
+        swaps, (parts, _, places) = 0, self.shares.sizes.shape
         edges = Edges(self.pairs, self.rise, self.mixing, self.ceiling, np.arange(len(self.pairs)))
-        numbers, hits = np.empty(cells // 4 + 1, np.uint64), np.empty(cells, bool)
+        numbers, hits = np.empty(places // 4 + 1, np.uint64), np.empty(places, bool)
         for _ in range(times):
-            before, key = self.sizes.copy(), next(self.keys)
-            self.parcels.bounds_outdated[:] = False
-            for part in np.array_split(np.arange(1, cells + 1), shares):
-                places = part[0], part[-1] + 1, part.size, numbers, numbers.view(np.uint16), hits
-                swaps += kernels.swap(self.parcels, self.slots, edges, self.means, before.max(), key, *places)
-            assert self.parcels.bounds_outdated[np.any(before != self.sizes, axis=1)].all()
+            before, key = self.shares.sizes.copy(), next(self.keys)
+            self.shares.swapped[:] = False
+            how = edges, self.means, before.max(), np.float32(1.0), key, numbers, numbers.view(np.uint16), hits
+            for part in range(parts)[::order]:
+                swaps += kernels.swap(self.shares, part, places, self.slots, *how)
+            assert self.shares.swapped[np.any(before != self.shares.sizes, axis=2)].all()
         return swaps
 
 
@@ -425,8 +435,8 @@ def test_a9_cells_are_conserved_bit_for_bit_and_their_strengths_travel_with_them
     """Of every index: the multiset of (size, strength) pairs; so the mass of every size class, exactly."""
     generator = np.random.default_rng(6)
     sizes = generator.uniform(0.008, 0.06, (5, 100)).astype(np.float32)
-    column = Column(sizes, RING, rise=rise, mixing=mixing, seed=6)
-    swaps = column.swap(20, shares=2)
+    column = Column(sizes, RING, rise=rise, mixing=mixing, seed=6, shares=2)
+    swaps = column.swap(20)
     assert (swaps > 50) == (rise > 0 or mixing > 0)
     moved = np.mean(column.sizes != sizes)
     assert (moved > 0.2) == (swaps > 0)
@@ -450,16 +460,10 @@ def test_slots_decide_which_parcels_swap():
 def test_shares_of_the_places_do_not_know_of_each_other(mixing):
     """So threads may take them in any order, or all at once."""
     sizes = np.random.default_rng(13).uniform(0.008, 0.06, (5, 128))
-    forward, alone, at_once = (Column(sizes, RING, rise=3.0, mixing=mixing, means=0.03, seed=13) for _ in range(3))
-    forward.swap(1, shares=2)
-    edges = Edges(alone.pairs, alone.rise, alone.mixing, 0 * alone.rise, np.arange(len(RING)))
-    numbers, key = np.empty(64, np.uint64), next(alone.keys)
-    work = numbers[:17], numbers[:17].view(np.uint16), np.empty(64, bool)
-    for column, first, last in ((alone, 65, 129), (alone, 1, 65), (at_once, 1, 129)):
-        places = first, last, 64, *work
-        kernels.swap(column.parcels, column.slots, edges, column.means, np.float32(sizes).max(), key, *places)
-    assert np.array_equal(forward.sizes, alone.sizes)
-    assert np.array_equal(forward.sizes, at_once.sizes)
+    forward, backward = (Column(sizes, RING, rise=3.0, mixing=mixing, means=0.03, seed=13, shares=2) for _ in range(2))
+    forward.swap()
+    backward.swap(order=-1)
+    assert np.array_equal(forward.sizes, backward.sizes)
     assert not np.array_equal(forward.sizes, np.float32(sizes))
 
 

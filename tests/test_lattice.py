@@ -38,6 +38,17 @@ def lattice(scene, seed=0, replicate=0, steady=None):
     return Lattice(scene, loads(scene), rooms.swap_rates(scene, bed), seed, replicate, steady or {})
 
 
+def sizes_in(machine):
+    """Sizes of all cells at (streamline, point, cell)."""
+    return machine.keep(machine.slots, np.empty((*machine.slots.shape, machine._scene.resolution.cells), np.float32))
+
+
+def refill(machine, sizes):
+    """Put other sizes (slot, cell) into the slots of a lattice."""
+    machine.parcels.sizes[:, 1:-1] = sizes
+    kernels.spread(machine.parcels, np.arange(machine.slots.size), machine._shares, machine._per_size)
+
+
 PLAIN = {"resolution.control_variate": False}  # which the lattice has not
 
 
@@ -84,8 +95,11 @@ def test_start_and_start_up_do_not_touch_the_steady_product(values):
 
 
 def fill_key(line, point, last):
-    """Key of the parcel that fills a point at the start; the first of all is that of the first steady snapshot."""
-    return (0, line, 0, 1 + last - point) if point else (0, line, 0)
+    """Key of the parcel that fills a point at the start, and its line of those that share the key.
+
+    The first of all have those of the first steady snapshot.
+    """
+    return ((0, 0, 0, 1 + last - point), line) if point else ((0, line, 0), 0)
 
 
 def test_crushed_start_of_zero_exchange_is_steady_from_the_start():
@@ -94,7 +108,7 @@ def test_crushed_start_of_zero_exchange_is_steady_from_the_start():
     startup = simulate(scene, seed=8)["size"].values[0]
     log_stress = loads(scene)
     for line, point in np.ndindex(startup.shape[:2]):
-        cells = [part[None] for part in first_cells(scene, 8, fill_key(line, point, startup.shape[1] - 1))]
+        cells = [part[None] for part in first_cells(scene, 8, *fill_key(line, point, startup.shape[1] - 1))]
         for level in log_stress[line, : point + 1]:
             cells = plain_crush(*cells, level, scene)
         assert np.array_equal(startup[line, point], cells[0][0])
@@ -170,15 +184,15 @@ class Watched:
             assert np.array_equal(parcels.breaks[passage.slots] - counts, broken)
             self.broken += broken.sum()
 
-        def watched_swap(parcels, slots, *rest):
-            before, were = parcels.sizes[slots, 1:-1], parcels.bounds_outdated.copy()
-            parcels.bounds_outdated[:] = False
-            count = swap(parcels, slots, *rest)
-            after = parcels.sizes[slots, 1:-1]
+        def watched_swap(shares, part, places, *rest):
+            before, were = shares.sizes[part, :, :places].copy(), shares.swapped[part].copy()
+            shares.swapped[part] = False
+            count = swap(shares, part, places, *rest)
+            after = shares.sizes[part, :, :places]
             # of every index the sizes, bit for bit, and so the mass of each size class
             assert np.array_equal(np.sort(after, axis=0), np.sort(before, axis=0))
-            assert np.all(parcels.bounds_outdated[slots] | ~np.any(before != after, axis=1))
-            parcels.bounds_outdated[:] |= were
+            assert shares.swapped[part, np.any(before != after, axis=1)].all()
+            shares.swapped[part] |= were
             self.swaps += count
             return count
 
@@ -228,11 +242,11 @@ def test_both_ways_of_swapping_meet_in_one_scene(monkeypatch):
     """Edges above and below the density at which every cell is decided, in the same substeps."""
     kinds, swap = set(), kernels.swap
 
-    def counting(parcels, slots, edges, means, largest, *rest):
+    def counting(shares, part, places, slots, edges, means, largest, *rest):
         lower, upper = edges.pairs.T
         most = edges.mixing + edges.rise * (np.maximum(largest - means[lower], 0) + means[upper])
         kinds.update((most > kernels.DENSE).tolist())
-        return swap(parcels, slots, edges, means, largest, *rest)
+        return swap(shares, part, places, slots, edges, means, largest, *rest)
 
     monkeypatch.setattr(kernels, "swap", counting)
     machine = lattice(mixed({"exchange.mixing": 0.02, "exchange.segregation": 0.02}), seed=11)
@@ -246,12 +260,12 @@ def test_parcels_shift_one_point_per_step():
     machine.advance(0)
     points = machine.slots.shape[1]
     for step in range(1, points + 3):
-        before, sizes = machine.slots.copy(), machine.parcels.sizes[:, 1:-1].copy()
+        before, sizes = machine.slots.copy(), sizes_in(machine)
         machine.advance(step)
         assert np.array_equal(machine.slots[:, 1:], before[:, :-1])
         assert np.array_equal(machine.slots[:, 0], before[:, -1])  # feed takes the place of what left
         assert np.array_equal(np.sort(machine.slots, axis=None), np.arange(machine.slots.size))
-        assert np.all(machine.sizes()[:, 1:] <= sizes[machine.slots[:, 1:]])  # only crushed
+        assert np.all(sizes_in(machine)[:, 1:] <= sizes[:, :-1])  # only crushed
 
 
 def test_feed_enters_fresh_at_every_step():
@@ -259,11 +273,33 @@ def test_feed_enters_fresh_at_every_step():
     machine, entered = lattice(scene, seed=12), []
     for step in range(5):
         machine.advance(step)
-        entered.append(machine.sizes()[:, 0])
+        entered.append(sizes_in(machine)[:, 0])
         assert (entered[-1] >= np.float32(0.008)).all()
         assert (entered[-1] <= np.float32(0.06)).all()
     entered = np.sort(np.array(entered).reshape(15, -1), axis=1)
     assert len({row.tobytes() for row in entered}) == 15
+
+
+def test_shares_are_the_parcels_they_came_from(monkeypatch):
+    """Cells go to the shares and back, with their strengths; sums are those of the sizes, to 3e-8 of the largest."""
+    monkeypatch.setattr(rooms, "_SHARE", 16)
+    machine = lattice(mixed({"resolution.cells": 45, "strength.scatter": 2.0}), seed=25)
+    machine.advance(0)
+    machine._swap(1)  # so that rows and shares differ
+    shares, every = machine._shares, np.arange(machine.slots.size)
+    sizes = machine.keep(every, np.empty((every.size, 45), np.float32))
+    assert np.mean(sizes != machine.parcels.sizes[:, 1:-1]) > 0.1
+    kernels.gather(shares, every, machine.parcels)
+    assert np.array_equal(machine.parcels.sizes[:, 1:-1], sizes)
+    assert not shares.swapped.any()
+    strengths = machine.parcels.weakness[:, 1:-1].copy()
+    assert np.array_equal(shares.weakness.swapaxes(0, 1).reshape(every.size, -1)[:, :45], strengths)
+    totals = shares.totals.sum(axis=0) / machine._per_size
+    assert np.allclose(totals, sizes.sum(axis=1, dtype=float), rtol=0, atol=45 * 3e-8 * 0.06)
+    machine.parcels.sizes[:, 1:-1] /= 2
+    kernels.spread(machine.parcels, every[::2], shares, machine._per_size)
+    halved = np.where(every[:, None] % 2 == 0, sizes / 2, sizes)
+    assert np.array_equal(machine.keep(every, sizes), halved)
 
 
 # --- determinism -------------------------------------------------------------------------------------------
@@ -291,7 +327,7 @@ def test_all_cores_give_the_bits_of_one(monkeypatch):
 def test_swaps_of_seeds_replicates_and_steps_differ(monkeypatch):
     """No two time steps of any of these runs draw from the same key; nor do turns, each of which has its own of it."""
     keys, swap = [], kernels.swap
-    monkeypatch.setattr(kernels, "swap", lambda *values: keys.append(int(values[5])) or swap(*values))
+    monkeypatch.setattr(kernels, "swap", lambda *values: keys.append(int(values[8])) or swap(*values))
     for seed, replicate in ((0, 0), (1, 0), (0, 1)):
         machine = lattice(mixed({"exchange.mixing": 1.0, "resolution.cells": 4}), seed, replicate)
         for step in range(4):
@@ -361,7 +397,7 @@ def test_start_up_begins_with_the_feed_where_nothing_crushes():
     first = simulate(scene, seed=18)["size"].values[0]
     log_stress = loads(scene)
     for line, point in np.ndindex(first.shape[:2]):
-        feed = [part[None] for part in first_cells(scene, 18, fill_key(line, point, first.shape[1] - 1))]
+        feed = [part[None] for part in first_cells(scene, 18, *fill_key(line, point, first.shape[1] - 1))]
         assert np.array_equal(first[line, point], plain_crush(*feed, log_stress[line, point], scene)[0][0])
     assert np.isneginf(log_stress).sum() >= 9
     swapped = simulate(scene.with_values(STRONG), seed=18)["size"].values[0]
@@ -430,20 +466,20 @@ def closed_lattice(values, cells, seed):
     machine = lattice(scene, seed=seed)
     machine.advance(0)
     sizes = machine.parcels.sizes[:, 1:-1]
-    sizes[:] = np.random.default_rng(seed).permutation(sizes.ravel()).reshape(sizes.shape)
+    refill(machine, np.random.default_rng(seed).permutation(sizes.ravel()).reshape(sizes.shape))
     return machine, load_bed(inputs_of(scene)).kinematics.y
 
 
 def test_mixing_spreads_marked_cells_over_all_points():
     """One streamline of grains of its own. The scatter of their share over points falls from 0.47 to under 0.2."""
     machine, _ = closed_lattice({"exchange.mixing": 2.0, "exchange.segregation": 0.0}, sized(500, 60), seed=20)
-    machine.parcels.sizes[:, 1:-1] = 0.01
-    machine.parcels.sizes[machine.slots[0], 1:-1] = 0.05
+    marked = np.isin(np.arange(machine.slots.size), machine.slots[0])
+    refill(machine, np.where(marked, 0.05, 0.01)[:, None])
     scatter = []
     for step in range(sized(60, 30)):
         machine._swap(step)
-        scatter.append(np.std(np.mean(machine.sizes() == np.float32(0.05), axis=2)))
-    assert np.mean(machine.sizes() == np.float32(0.05)) == pytest.approx(1 / 3, rel=1e-12)
+        scatter.append(np.std(np.mean(sizes_in(machine) == np.float32(0.05), axis=2)))
+    assert np.mean(sizes_in(machine) == np.float32(0.05)) == pytest.approx(1 / 3, rel=1e-12)
     assert scatter[0] < math.sqrt(2) / 3
     assert 0 < scatter[-1] < 0.2
 
@@ -456,7 +492,7 @@ def test_segregation_lifts_large_grains():
     machine, height = closed_lattice({"exchange.mixing": 0.0, "exchange.segregation": 2.0}, sized(500, 60), seed=21)
 
     def lifted():
-        weight = machine.sizes().astype(float)
+        weight = sizes_in(machine).astype(float)
         noise = weight.std() * height.std() / (weight.mean() * math.sqrt(weight.size))
         return (np.sum(weight.sum(axis=2) * height) / weight.sum() - height.mean()) / noise
 
@@ -470,13 +506,13 @@ def test_the_lattice_keeps_probabilities_at_one_half(monkeypatch):
     """What every substep of a strong scene is given, with the largest grain there is anywhere."""
     swap, sums = kernels.swap, []
 
-    def watched(parcels, slots, edges, means, largest, *rest):
+    def watched(shares, part, places, slots, edges, means, largest, *rest):
         lower, upper = edges.pairs.T
         most = edges.mixing + edges.rise * (np.maximum(largest - means[lower], 0) + means[upper])
         for turns in np.split(edges.turns, np.flatnonzero(np.diff(edges.turns) <= 0) + 1):  # one substep each, or two
             points = np.concatenate([lower[turns], upper[turns]])
             sums.append(np.bincount(points, np.tile(most[turns], 2)).max())
-        return swap(parcels, slots, edges, means, largest, *rest)
+        return swap(shares, part, places, slots, edges, means, largest, *rest)
 
     monkeypatch.setattr(kernels, "swap", watched)
     simulate(mixed({"exchange.segregation": 2.0, "exchange.mixing": 2.0, "resolution.cells": 8}))
@@ -502,7 +538,7 @@ def test_the_mean_field_is_the_mean_of_the_lattice():
     machine = lattice(scene, seed=22)
     for step in range(30):
         machine.advance(step)
-    found, coarse = np.mean(machine.sizes() > 0.02, axis=2), np.empty((3, 30))
+    found, coarse = np.mean(sizes_in(machine) > 0.02, axis=2), np.empty((3, 30))
     for point in range(30):  # a lattice that begins there gets what has swapped with all above
         entering = rooms.settle(scene, machine._rates, machine.slots.shape, point).entering
         coarse[:, point] = entering[:, entering.shape[1] // 2 :].sum(axis=1)
@@ -545,7 +581,7 @@ def test_predicted_memory_of_the_lattice_is_that_of_its_arrays():
 
     def held(scene):
         machine = lattice(scene)
-        parts = [*machine.parcels, *vars(machine).values()]
+        parts = [*machine.parcels, *machine._shares, *vars(machine).values()]
         return sum(part.nbytes for part in parts if isinstance(part, np.ndarray))
 
     predicted = cost.predict(many).bytes - cost.predict(few).bytes

@@ -277,19 +277,20 @@ def _weakness(state, ore):
 
 
 @_compiled
-def start_parcels(bases, ore, uniforms, streams, weakness):
-    """Fill uniforms (parcel, cell), streams and weakness (parcel, cell + 2) from two 64-bit bases each, (parcel, 2).
+def start_parcels(bases, ore, slots, uniforms, streams, weakness):
+    """Fill uniforms (parcel, cell), and slots of streams and weakness, from two 64-bit bases each, (parcel, 2).
 
     A stream starts at the mix of the first base and the cell's place. Of the uniforms there is one in each of as many
     equal strata, in random order (Fisher & Yates).
     """
     cells = uniforms.shape[1]
-    for k in range(bases.shape[0]):
+    for k in range(slots.size):
+        slot = slots[k]
         for p in range(1, cells + 1):
-            streams[k, p] = mix(bases[k, 0] + np.uint64(p) * _GOLDEN)
+            streams[slot, p] = mix(bases[k, 0] + np.uint64(p) * _GOLDEN)
         if weakness is not None:
             for p in range(1, cells + 1):
-                weakness[k, p] = _weakness(streams[k, p], ore)
+                weakness[slot, p] = _weakness(streams[slot, p], ore)
         state = bases[k, 1]
         for p in range(cells):
             uniforms[k, p] = p
@@ -300,6 +301,16 @@ def start_parcels(bases, ore, uniforms, streams, weakness):
         for p in range(cells):
             state += _GOLDEN
             uniforms[k, p] = (uniforms[k, p] + uniform(state)) / cells
+
+
+@_compiled
+def put(parcels, slots, sizes):
+    """Put unbroken cells of these sizes (parcel, cell), m, in the slots."""
+    for k in range(slots.size):
+        slot = slots[k]
+        for p in range(sizes.shape[1]):
+            parcels.sizes[slot, p + 1] = max(sizes[k, p], SMALLEST)
+        parcels.bounds_outdated[slot], parcels.breaks[slot] = True, 0
 
 
 # --- sieves -------------------------------------------------------------------------------------------------
@@ -952,14 +963,18 @@ def swap_mean_field(fractions, sizes, edges, means, swaps, ups, downs):
         rise, mixing, below, above, held_below, held_above = drive
         rising = sinking = mixing
         for c in range(sizes.size):
-            up, down = max(sizes[c] - below, 0.0), max(above - sizes[c], 0.0)
-            ups[c], downs[c] = rise * up / (1.0 + held_below * up), rise * down / (1.0 + held_above * down)
+            ups[c], downs[c] = max(sizes[c] - below, 0.0), max(above - sizes[c], 0.0)
+        if held_below > 0.0:  # or else without quotients, which take as long as all the rest
+            for c in range(sizes.size):
+                ups[c], downs[c] = ups[c] / (1.0 + held_below * ups[c]), downs[c] / (1.0 + held_above * downs[c])
+        rising = sinking = 0.0
         for c in range(sizes.size):
             rising += fractions[lower, c] * ups[c]
             sinking += fractions[upper, c] * downs[c]
+        rising, sinking = mixing + rise * rising, mixing + rise * sinking
         for c in range(sizes.size):
-            flow = fractions[lower, c] * (mixing + ups[c] + sinking) - fractions[upper, c] * (
-                mixing + rising + downs[c]
+            flow = fractions[lower, c] * (mixing + rise * ups[c] + sinking) - fractions[upper, c] * (
+                mixing + rising + rise * downs[c]
             )
             fractions[lower, c] -= flow
             fractions[upper, c] += flow

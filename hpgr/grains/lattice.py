@@ -193,7 +193,7 @@ class Lattice:
         cells, scattered = scene.resolution.cells, math.isfinite(scene.strength.scatter)
         self.parcels = kernels.make_parcels(log_stress.size, cells, scattered)
         self._shares = kernels.make_shares(log_stress.size, cells, _SHARE, scattered)
-        self._per_size = np.float32(2.0**30 / scene.feed.largest_grain)  # parts in which sizes are summed, to 1e-9
+        self._per_size = np.float32(2.0**30 / scene.feed.largest_grain)  # parts in which sizes are summed, to 3e-8
         self._works = [kernels.make_work(cells) for _ in range(cores.count)]
         self._home = np.arange(log_stress.size).reshape(log_stress.shape)
         self.slots = self._home
@@ -211,10 +211,12 @@ class Lattice:
         self._crush(slots, lines, points, points + 1)
         self._swap(step)
 
-    def sizes(self, slots: np.ndarray) -> np.ndarray:
-        """Return the sizes of all cells in these slots, (..., cell), m."""
-        kernels.gather(self._shares, slots.ravel(), self.parcels)
-        return self.parcels.sizes[slots, 1:-1]
+    def keep(self, slots: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+        """Copy the sizes of all cells in these slots to `sizes`, (..., cell), m, and return them."""
+        for part, share in enumerate(self._shares.sizes):
+            kept = sizes[..., part * _SHARE : (part + 1) * _SHARE]
+            kept[...] = share[slots, : kept.shape[-1]]
+        return sizes
 
     def classes(self, sieves: np.ndarray) -> np.ndarray:
         """Return the cells of each sieve class, (streamline, point, sieve + 1)."""
@@ -242,11 +244,8 @@ class Lattice:
         at_once = max(march.AT_ONCE // (len(slots) * self._scene.resolution.cells), 1)
         for first in range(0, slots.shape[1], at_once):
             part = slots[:, first : first + at_once].T
-            bases = [self._bases(step - first - point) for point in range(len(part))]
-            fresh = march.first_cells(self._scene, np.concatenate(bases), self._entering)
-            for mine, new in zip(self.parcels, fresh, strict=True):
-                if mine is not None:
-                    mine[part.ravel()] = new
+            bases = np.concatenate([self._bases(step - first - point) for point in range(len(part))])
+            march.fill(self.parcels, part.ravel(), self._scene, bases, self._entering)
         kernels.spread(self.parcels, slots.ravel(), self._shares, self._per_size)
         if step == 0 and self._scene.exchange.start == "crushed":
             lines, points = np.divmod(np.arange(self.slots.size), self.slots.shape[1])
@@ -358,7 +357,10 @@ def run(
     steady = [last + k * wishes.interval for k in range(grid.snapshots)]
     steps = [*(range(0, last, wishes.interval) if wishes.record_startup else ()), *steady]
     sieves, mine = march.cell_sieves(scene), np.ascontiguousarray(log_stress[:, first:])
-    sizes, classes, product, breaks = [], [], [], np.zeros(log_stress.shape[0], np.int64)
+    product = np.empty((len(steady), grid.streamlines, grid.cells), np.float32)
+    shape = (len(steps), *mine.shape, grid.cells)
+    sizes, classes = np.empty(shape, np.float32) if grid.record == "cells" else None, []
+    breaks = np.zeros(grid.streamlines, np.int64)
     with march.cores(mine.size * grid.cells) as cores:
         numbers = {step: k for k, step in enumerate(steady)}
         lattice = Lattice(scene, mine, rates, seed, replicate, numbers, cores, entering)
@@ -367,14 +369,13 @@ def run(
             lattice.advance(step)
             if step not in steps:
                 continue
-            if grid.record == "cells":
-                sizes.append(lattice.sizes(lattice.slots))
+            if sizes is not None:
+                lattice.keep(lattice.slots, sizes[steps.index(step)])
             if grid.record == "distributions":
                 classes.append(lattice.classes(sieves))
             if step >= last:
-                at_exit = lattice.slots[:, -1]
-                product.append(lattice.sizes(at_exit))
-                breaks += lattice.parcels.breaks[at_exit]
+                lattice.keep(lattice.slots[:, -1], product[numbers[step]])
+                breaks += lattice.parcels.breaks[lattice.slots[:, -1]]
     # as of the whole lattice, which goes on for `first` more steps; a start-up of feed swaps more often
     swaps += (lattice.swaps + first * (lattice.swaps - before)) / grid.cells / (steps[-1] + 1 + first)
     exchanged = Exchanged(
@@ -383,8 +384,8 @@ def run(
         substeps=max(lattice.most_substeps, substeps),
         swaps_per_cell=2 * swaps / grid.streamlines,
     )
-    product, sizes, classes = (np.stack(part)[None] if part else None for part in (product, sizes, classes))
-    return Cells(product, breaks[None], sizes, classes), exchanged
+    kept = None if sizes is None else sizes[None], np.stack(classes)[None] if classes else None
+    return Cells(product[None], breaks[None], *kept), exchanged
 
 
 def _quantile_of(scene: Scene, shares: np.ndarray) -> Callable:

@@ -68,24 +68,25 @@ def _bases(seed: int, key: tuple[int, ...]) -> tuple[int, int]:
 
 
 def bases(seed: int, keys: list[tuple[int, ...]]) -> np.ndarray:
-    """Return the two 64-bit numbers, (parcel, 2), that decide every bit of the parcels of these keys.
-
-    A key is (replicate, streamline, snapshot).
-    """
+    """Return the two 64-bit numbers, (parcel, 2), that decide every bit of parcels, by (replicate, line, snapshot)."""
     return np.array([_bases(seed, key) for key in keys], np.uint64)
 
 
-def first_cells(scene: Scene, bases: np.ndarray, quantile: Callable | None = None) -> Parcels:
-    """Return parcels of feed, a slot for each pair of bases (parcel, 2).
+def fill(parcels: Parcels, slots: np.ndarray, scene: Scene, bases: np.ndarray, quantile: Callable | None) -> None:
+    """Put parcels of feed, each with its bases, in these slots.
 
     Sizes are the quantiles of the feed, or those given, at stratified uniforms in random cell order: one uniform in
     each of as many equal strata represents the feed with a lower variance than plain sampling.
     """
-    uniforms = np.empty((len(bases), scene.resolution.cells))
-    parcels = kernels.make_parcels(*uniforms.shape, scattered=np.isfinite(scene.strength.scatter))
-    kernels.start_parcels(bases, ore(scene), uniforms, parcels.streams, parcels.weakness)
-    sizes = (quantile or scene.feed.quantile)(uniforms)
-    np.maximum(sizes, kernels.SMALLEST, out=parcels.sizes[:, 1:-1], casting="same_kind")
+    uniforms = np.empty((slots.size, scene.resolution.cells))
+    kernels.start_parcels(bases, ore(scene), slots, uniforms, parcels.streams, parcels.weakness)
+    kernels.put(parcels, slots, (quantile or scene.feed.quantile)(uniforms))
+
+
+def first_cells(scene: Scene, seed: int, keys: list[tuple[int, ...]], quantile: Callable | None = None) -> Parcels:
+    """Return parcels of feed, a slot for each key; see `bases` and `fill`."""
+    parcels = kernels.make_parcels(len(keys), scene.resolution.cells, np.isfinite(scene.strength.scatter))
+    fill(parcels, np.arange(len(keys)), scene, bases(seed, keys), quantile)
     return parcels
 
 
@@ -169,7 +170,7 @@ def march(
             (scenes[number].feed, len(list(same)))
             for number, same in itertools.groupby(columns[part], lambda one: one[0][0])
         ]
-        parcels = first_cells(scene, bases(seed, keys[part]), partial(_quantiles, feeds))
+        parcels = first_cells(scene, seed, keys[part], partial(_quantiles, feeds))
         slots = np.arange(parcels.breaks.size)
         passage = Passage(slots, lines[part], 0 * slots, 0 * slots + points)
         own = Record(record.sieves, *(None if kept is None else kept[part] for kept in record[1:]))
