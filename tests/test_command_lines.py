@@ -14,6 +14,7 @@ from support import SCENE_TOML as SCENE
 from support import one_by_one
 
 import hpgr
+from hpgr.bed.machine import specific_pressing_force
 from studies import command, feed_sweep, gap_sweep, speed_sweep
 from studies.__main__ import commands
 from studies.__main__ import main as any_study
@@ -111,6 +112,18 @@ def test_defaults(run, folder, name, axis, own):
     assert result.attrs["history"] == " ".join([f"python -m studies.{name}", *SMALL, *plot])
     if name == "speed_sweep":
         assert "speed changes throughput and nothing else" in out
+
+
+@pytest.mark.parametrize("preset", hpgr.presets.NAMES)
+@pytest.mark.parametrize("name", STUDIES)
+def test_no_default_of_a_preset_presses_the_bed_to_more_than_rock(run, name, preset):
+    """Within twice the force of the scene's own gap; 30 mm of `industrial` would carry 300,000 times as much."""
+    code, _, err = run("--scene", preset, "--cells", "0", "--replicates", "1", "--no-plot", study=STUDIES[name])
+    assert code == 0, err
+    force = opened(f"outputs/{name}.nc")["specific_pressing_force"]
+    scene = hpgr.Scene.preset(preset).with_values({"resolution.points": 40})
+    assert force.max() < 2.02 * specific_pressing_force(scene)
+    assert name != "gap_sweep" or force.max() > 1.5 * force.min()
 
 
 def test_further_axes_come_after_the_study_s_own(run):

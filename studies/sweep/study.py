@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 
 _DRAWS = 32  # samples of a calibration
+_MOST_FORCE = 2.0  # on the narrowest gap of a default range, over that of the scene's own gap
 _ALIKE_CAPTION = (
     "Tests of one feed tell k, the scatter of strength, no better than this: with the k of each further scene the "
     "product of the seven tests is missed by 9 % more than with the preset's own, and what the feed does lies between "
@@ -201,13 +202,29 @@ def _space(study: Study, options: Options, scene: Scene, given: dict[str, list],
 
 
 def _default_values(study: Study, scene: Scene) -> list[float]:
-    """Return the scene's own value times the study's factors."""
+    """Return the scene's own value times the study's factors; of the gap as far as the bed can be pressed."""
     section, key = AXES[study.main].split(".")
     own = getattr(getattr(scene, section), key)
     if own is None and key == "top_size":
         own = scene.feed.largest_grain
     shown = unit_shown(field_info(AXES[study.main]).unit)[1]
-    return [own if factor == 1 else float(f"{own * factor * shown:.3g}") / shown for factor in study.factors]
+    factors = _carried(study.factors, scene) if study.main == "gap" else study.factors
+    return [own if factor == 1 else float(f"{own * factor * shown:.3g}") / shown for factor in factors]
+
+
+def _carried(factors: tuple[float, ...], scene: Scene) -> tuple[float, ...]:
+    """Return factors of the gap, drawn together so that no gap carries more than twice the force of the scene's own.
+
+    Where the nip takes in what it grips, the bed would else be denser than rock: of `industrial` at 0.83 of its gap.
+    """
+    from hpgr.bed import machine  # late: `--help` does without
+
+    try:
+        narrowest = machine.operating_gap(scene, _MOST_FORCE * machine.specific_pressing_force(scene))
+    except ValueError:  # no gap carries as much
+        return factors
+    reach = min(1.0, (1 - narrowest / scene.rolls.gap) / (1 - factors[0]))
+    return tuple(1 + (factor - 1) * reach for factor in factors)
 
 
 def _sieve(options: Options, scene: Scene) -> float:
