@@ -355,11 +355,7 @@ def compared(result: "xr.Dataset") -> str:
 
 
 def assemble(
-    tests: Sequence[Any],
-    known: Sequence[str],
-    models: Sequence[Model],
-    scene: Scene,
-    samples: dict[str, np.ndarray],
+    tests: Sequence[Any], known: Sequence[str], models: Sequence[Model], scene: Scene, samples: dict[str, np.ndarray]
 ) -> "xr.Dataset":
     """Return measured and predicted figures of every test as one Dataset; NaN is not measured, or not predicted."""
     from hpgr.results import schema

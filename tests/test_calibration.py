@@ -101,10 +101,7 @@ def test_constants_of_machine_and_feed_are_each_groups_own_and_idle_power_is_tak
     other = first._replace(name="B1", diameter=1.0, width=0.4, solid_density=2900.0, idle_power=5e3)
     made = [
         measured(planted(["gamma"]).with_values(values), test)
-        for values, test in (
-            ({}, first),
-            ({"elasticity.bulk_modulus": 80e6, "elasticity.shear_modulus": 37e6}, other),
-        )
+        for values, test in (({}, first), ({"elasticity.bulk_modulus": 80e6, "elasticity.shear_modulus": 37e6}, other))
     ]
     found = fit_tests(start(), made, ["gamma", "K"])
     assert list(found.estimates) == ["gamma", "K", "K of B1"]

@@ -340,11 +340,7 @@ def test_what_is_recorded_does_not_touch_the_product():
     """Neither the record, nor the start-up's snapshots, nor how often a steady one follows another."""
     scene = mixed(STRONG | {"exchange.interval": 4})
     wanted = simulate(scene, seed=16)
-    for values in (
-        {"resolution.record": "distributions"},
-        {"exchange.record_startup": True},
-        {"exchange.interval": 9},
-    ):
+    for values in ({"resolution.record": "distributions"}, {"exchange.record_startup": True}, {"exchange.interval": 9}):
         found = simulate(scene.with_values(values), seed=16)
         for name in PRODUCT:
             assert np.array_equal(found[name], wanted[name]), (values, name)

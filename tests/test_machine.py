@@ -219,11 +219,7 @@ def test_power_beyond_any_force_angle_has_it_held_at_90_degrees():
 
 
 DENSE = {"bed.max_solid_fraction": 0.75}  # every bed below reaches it
-BEDS = {
-    "power": paper(DENSE),
-    "nip": pilot(DENSE),
-    "cake": pilot(DENSE | {"flow": NipFlow(cake_solid_fraction=0.74)}),
-}
+BEDS = {"power": paper(DENSE), "nip": pilot(DENSE), "cake": pilot(DENSE | {"flow": NipFlow(cake_solid_fraction=0.74)})}
 
 
 @pytest.mark.parametrize("scene", BEDS.values(), ids=BEDS)

@@ -238,11 +238,7 @@ def test_exchange_reaches_product_and_startup(scene):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--cells", "0"], "--cells: got 0"),
-        (["--shown-points", "2"], "--shown-points: got 2"),
-    ],
+    ("arguments", "message"), [(["--cells", "0"], "--cells: got 0"), (["--shown-points", "2"], "--shown-points: got 2")]
 )
 def test_what_cannot_be_is_refused(arguments, message, tmp_path, capsys):
     assert study.main([*arguments, "--out", str(tmp_path / "new")]) == 2

@@ -157,10 +157,7 @@ def test_same_bits_with_and_without_other_slices_of_the_same_place():
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        (
-            {"exchange": {}},
-            "must not be given beside exchange, which is not simulated slice by slice",
-        ),
+        ({"exchange": {}}, "must not be given beside exchange, which is not simulated slice by slice"),
         ({"resolution.record": "cells"}, "must be 'product' with a roll_width; take record = 'product'"),
         ({"resolution.record": "distributions"}, "must be 'product' with a roll_width"),
         ({"roll_width": {"pressure_drop": 1.1}}, "must be at most 1"),

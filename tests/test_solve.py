@@ -34,10 +34,7 @@ def load(scene, points=61):
             "march",  # without size effect there is no critical size
         ),
         ({"strength.cushioning": 100.0, "resolution.record": "product"}, "march, control variate"),
-        (
-            {"strength.cushioning": 100.0, "resolution.record": "product", "resolution.control_variate": False},
-            "march",
-        ),
+        ({"strength.cushioning": 100.0, "resolution.record": "product", "resolution.control_variate": False}, "march"),
     ],
 )
 def test_the_cheapest_solver_is_chosen_and_told(values, solver):
