@@ -42,18 +42,19 @@ def predict(scene: Scene) -> Cost:
     simple = math.isinf(scene.strength.scatter) and scene.fragments.size_exponent == 0
     fields = lines * ((points - 1) * scene.elasticity.substeps + 1)
     size, seconds = 150 * fields, 1.5e-3 + 0.25e-6 * fields  # motion and stress, with temporaries
-    if solver == "closed form":
+    closed, controlled = solver == "closed form", is_controlled(scene)
+    if closed or controlled:
         each, time = (5_000, 40e-6) if simple else (26_000, 150e-6)  # nodes of quadratures, or classes of a cascade
-        everywhere = lines * points if grid.record == "distributions" else 0
+        everywhere = lines * points if closed and grid.record == "distributions" else 0
         size += each * max(columns, min(everywhere, 4000))  # at once, see hpgr.grains.solve
         seconds += time * (columns + 0.5 * everywhere)
-    elif cells:
+    if cells and not closed:
         product = grid.snapshots * columns * cells
         at_once = (os.cpu_count() or 1) * max(AT_ONCE // cells, 1)  # parcels
         size += (12 if slices == 1 else 62) * product  # kept, pooled, sorted; with slices ordered by their shares
-        size += 8 * product if is_controlled(scene) else 0  # what cells come to without cushioning, kept and pooled
+        size += 8 * product * controlled  # what cells come to without cushioning, kept and pooled
         size += 40 * cells * min(columns * grid.snapshots, at_once)  # work space
-        seconds += product * (0.2e-6 + 0.15e-9 * points)
+        seconds += product * (0.2e-6 + 0.15e-9 * points + 0.01e-6 * controlled)
     if solver.endswith("lattice"):
         steps = points + grid.snapshots * exchange.interval
         frames += -(-(points - 1) // exchange.interval) if exchange.record_startup else 0

@@ -1,3 +1,4 @@
+import math
 import os
 import subprocess
 import sys
@@ -33,6 +34,13 @@ def test_cost_grows_with_every_size(name):
     small, large = cost.predict(scene), cost.predict(scene.with_values({name: 10 * count}))
     assert large.bytes > small.bytes
     assert large.seconds > small.seconds
+
+
+@pytest.mark.parametrize(("scatter", "column"), [(math.inf, 40e-6), (0.4, 150e-6)])
+def test_a_control_variate_costs_a_closed_form_a_column_and_ten_nanoseconds_a_cell(scatter, column):
+    scene = paper({"resolution.snapshots": 2, "strength.scatter": scatter, "resolution.record": "distributions"})
+    more = cost.predict(scene).seconds - cost.predict(scene.with_values({"resolution.control_variate": False})).seconds
+    assert more == pytest.approx(3 * column + 2 * 3 * 64 * 1e-8, rel=1e-9)
 
 
 def test_scene_beyond_the_memory_is_refused_with_bytes_bound_and_remedy(monkeypatch):
