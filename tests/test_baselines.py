@@ -34,27 +34,9 @@ def pilot():
 
 def made_up(name="A", speed=0.7, force=3e6, **measured):
     """Return a test without any measured product."""
-    nothing = np.full(len(SIZES), math.nan)
-    values = {
-        "gap": 0.018,
-        "cake_thickness": 0.022,
-        "throughput": math.nan,
-        "specific_throughput": math.nan,
-        "power": math.nan,
-        "specific_energy": math.nan,
-        "hydraulic_pressure": 2 * force,
-        "moisture": math.nan,
-        "diameter": math.nan,
-        "width": math.nan,
-        "solid_density": math.nan,
-        "idle_power": math.nan,
-        "cake_density": math.nan,
-        "sizes": SIZES,
-        "feed": FEED,
-        "centre": nothing,
-        "edge": nothing,
-        "total": nothing,
-    }
+    values = dict.fromkeys(tables.PilotTest._fields[3:], math.nan)
+    values |= dict.fromkeys(baselines.PRODUCTS, np.full(len(SIZES), math.nan))
+    values |= {"gap": 0.018, "cake_thickness": 0.022, "hydraulic_pressure": 2 * force, "sizes": SIZES, "feed": FEED}
     return tables.PilotTest(name, speed, force, **(values | measured))
 
 

@@ -157,19 +157,6 @@ def test_points_end_at_the_exit_and_run_along_their_streamlines(values):
     assert np.diff(motion.residence_time) == pytest.approx(motion.time_step, rel=1e-10)
 
 
-@each
-def test_doubling_the_roll_speed_halves_times_and_nothing_else(values):
-    scene = paper(values)
-    (_, slow, strains), (_, fast, same) = (
-        moved(scene.with_values({"rolls.speed": factor * scene.rolls.speed})) for factor in (1, 2)
-    )
-    for name, factor in {"x": 1, "y": 1, "speed": 2, "volumetric_rate": 2, "shear_rate": 2}.items():
-        assert np.array_equal(getattr(fast, name), factor * getattr(slow, name)), name
-    assert np.array_equal(fast.residence_time, slow.residence_time / 2)
-    assert fast.time_step == slow.time_step / 2
-    assert np.array_equal(strains, same)
-
-
 # --- the paper's profile ------------------------------------------------------------------------------------
 
 

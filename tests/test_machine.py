@@ -163,26 +163,6 @@ def test_identities_of_force_torque_power_and_energy(scene):
         assert getattr(idling, name) == getattr(bare, name)
 
 
-def test_moduli_times_8_give_force_and_power_times_8():
-    for scene in (pilot({"rolls.idle_torque": 0.0}), paper()):
-        moduli = {
-            f"elasticity.{name}": 8 * getattr(scene.elasticity, name) for name in ("bulk_modulus", "shear_modulus")
-        }
-        stiff = scene.with_values(moduli)
-        soft, hard = performance(scene), performance(stiff)
-        for name in ("pressing_force", "specific_pressing_force", "torque", "power", "specific_energy"):
-            assert getattr(hard, name) == 8 * getattr(soft, name) > 0
-        assert (hard.force_angle, hard.nip_angle) == (soft.force_angle, soft.nip_angle)
-        assert machine.specific_pressing_force(stiff) == 8 * machine.specific_pressing_force(scene)
-
-
-def test_speed_times_2_doubles_power_and_throughput_and_nothing_else():
-    for scene in (pilot(), paper()):
-        slow, fast = performance(scene), performance(scene.with_values({"rolls.speed": 2 * scene.rolls.speed}))
-        assert fast._replace(power=slow.power) == slow
-        assert fast.power == 2 * slow.power
-
-
 @pytest.mark.parametrize("values", [{}, {"roll_width": {"pressure_drop": 0.9}}, {"elasticity.substeps": 3}])
 def test_pressing_force_alone_is_that_of_the_whole_scene(values):
     for scene in (pilot(values), paper(values | {"resolution.record": "product"})):

@@ -262,16 +262,6 @@ def test_pressure_rises_sharply_with_depth_and_is_larger_at_mid_gap():
         assert half_way < 0.35 * y[0]  # half of the rise within the lowest third of the bed
 
 
-@pytest.mark.parametrize("integrator", ["increment", "euler"])
-def test_moduli_times_8_give_pressures_times_8(integrator):
-    scene = paper({"elasticity.integrator": integrator})
-    stiff = {f"elasticity.{name}": 8 * getattr(scene.elasticity, name) for name in ("bulk_modulus", "shear_modulus")}
-    soft, hard = (loaded(one, 61) for one in (scene, scene.with_values(stiff)))
-    assert np.array_equal(hard.pressure, 8 * soft.pressure)
-    assert np.array_equal(hard.shear_stress, 8 * soft.shear_stress)
-    assert np.array_equal(hard.on_shear_limit, soft.on_shear_limit)
-
-
 def test_a_tiny_shear_limit_is_kept_to_the_last_bit():
     """The plain sum of shear is ten million times the limit, and loses as many digits of it."""
     soft = {"elasticity.bulk_modulus": 1.0, "elasticity.shear_modulus": 1e12, "elasticity.exponent": 9.9}
