@@ -12,6 +12,7 @@ from hpgr.grains.kernels import Passage, Path, Record
 from hpgr.grains.march import ore
 from hpgr.laws.fragments import Fragments
 from hpgr.laws.strength import Strength
+from hpgr.results.schema import STATUS
 
 SCENE_TOML = """
 [rolls]
@@ -152,6 +153,16 @@ def ks_distance(sample, distribution):
     exact = distribution(ordered)
     count = np.arange(ordered.size + 1) / ordered.size
     return max(np.max(count[1:] - exact), np.max(exact - count[:-1]))
+
+
+def lose(result, message, status="failed", **place):
+    """Make cases of a sweep's result lost, as a sweep would."""
+    for name in result.data_vars:
+        if result[name].dtype.kind == "f":
+            result[name][place] = np.nan
+    result["status"][place] = STATUS[status]
+    result["message"] = result["message"].astype(object)
+    result["message"][place] = message
 
 
 def under(stress, time_step=1.0):

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from support import paper
+from support import lose, paper
 
 import hpgr
-from hpgr.results.schema import STATUS
 from studies import explore
 from studies.show import page, report
 from studies.sweep import netcdf, sweep
@@ -68,15 +67,6 @@ def saved(request, three, tmp_path_factory):
     path = tmp_path_factory.mktemp("saved") / f"{request.param}.nc"
     netcdf.write_dataset(made, path)
     return explore.opened(path), path
-
-
-def lose(result, message, **place):
-    for name in result.data_vars:
-        if result[name].dtype.kind == "f":
-            result[name][place] = np.nan
-    result["status"][place] = STATUS["failed"]
-    result["message"] = result["message"].astype(object)
-    result["message"][place] = message
 
 
 def embedded(page):

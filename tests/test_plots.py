@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.container import ErrorbarContainer
-from support import paper
+from support import lose, paper
 
-from hpgr.results.schema import STATUS
 from studies.show import plots, report
 from studies.show.plots.sweeps import sweep_figure
 from studies.sweep import sweep
@@ -165,11 +164,8 @@ def test_stress_only_has_no_empty_panel_and_a_flat_curve_looks_flat():
 
 def test_lost_points_are_left_out(swept):
     result = swept.copy(deep=True)
-    for name in result.data_vars:
-        if result[name].dtype.kind == "f":
-            result[name][{"gap": 1, "roll_speed": 1}] = np.nan
-            result[name][{"gap": 0, "roll_speed": 0, "replicate": 0}] = np.nan
-    result["status"][{"gap": 1, "roll_speed": 1}] = STATUS["failed"]
+    lose(result, "boom", gap=1, roll_speed=1)
+    lose(result, "boom", gap=0, roll_speed=0, replicate=0)
     figure = draw(result)
     shown = max((texts(legend) for legend in figure.legends), key=len)
     assert shown == ["60 mm, 10 rpm", "60 mm, 20 rpm", "40 mm, 10 rpm", "50 mm, 10 rpm (and 1 alike)"]

@@ -4,10 +4,9 @@ import re
 import numpy as np
 import pytest
 import xarray as xr
-from support import paper
+from support import lose, paper
 
 from hpgr.results.flags import BITS
-from hpgr.results.schema import STATUS
 from studies.show import report
 from studies.sweep import sweep
 
@@ -22,15 +21,6 @@ def swept():
 @pytest.fixture
 def result(swept):
     return swept.copy(deep=True)
-
-
-def lose(result, message, status="failed", **place):
-    """Make cases of a result lost, as a sweep would."""
-    for name in result.data_vars:
-        if result[name].dtype.kind == "f":
-            result[name][place] = np.nan
-    result["status"][place] = STATUS[status]
-    result["message"][place] = message
 
 
 def replicates(*values):

@@ -21,6 +21,7 @@ from hpgr.results import schema
 from hpgr.run import load, run_scene, run_together
 from studies import close_circuit, open_cases, optimise
 from studies.circuit import Screen
+from studies.guard.invariants import violations
 from studies.sweep import sweep
 
 INF = math.inf
@@ -111,22 +112,13 @@ def test_the_path_of_a_scene_is_refused_with_what_reads_it():
     ],
     ids=str,
 )
-def test_sizes_are_positive_never_grow_and_stay_below_the_feeds_top(values):
+def test_grains_only_get_finer_from_the_feed_on_and_every_invariant_holds(values):
     scene = paper(values | {"resolution.snapshots": 2})
     ds = simulate(scene)
-    size = ds["size"].values
-    start = feed_sizes(scene)
-    along = np.concatenate([start[:, :, None], size], axis=2)
-    assert np.all(np.diff(along, axis=2) <= 0)
-    assert size.min() >= np.float32(kernels.SMALLEST)
-    assert size.max() <= np.float32(scene.feed.largest_grain)
-    for name in ("passing", "passing_total"):
-        found = ds[name].values
-        assert np.all((found >= 0) & (found <= 1))
-        assert np.all(np.diff(found, axis=-1) >= 0)
-        assert np.all(found[..., -1] == 1)
-    for name in ds.variables:
-        assert np.all(np.isfinite(ds[name])), name
+    assert violations(ds) == []
+    size, start = ds["size"].values, feed_sizes(scene)
+    assert np.all(size[:, :, 0] <= start)
+    assert np.all(ds["passing_total"][-1] == 1)
     if ds.sizes["point"] == 61 and not np.isinf(scene.strength.cushioning):  # a cell whose size changed has broken
         assert np.all(ds["breaks_per_cell"] >= np.mean(size[:, :, -1] < start, axis=(0, 2)))
 
@@ -259,13 +251,6 @@ def test_a_number_in_another_unit_is_flagged_before_all_else_with_the_unit_meant
     assert re.match(f"unusual_machine: .*{words}", said)
 
 
-def test_top_size_far_above_the_gap_is_flagged():
-    for gap, flagged in ((0.041, False), (0.039, True)):
-        ds = simulate(paper({"rolls.gap": gap, "resolution.cells": 0}))
-        assert ("single_particle_nipping" in flags(ds)) is flagged
-    assert "top size is 1.54 gaps; above 1.5" in ds.attrs["diagnostics"]
-
-
 def test_feed_that_no_stress_breaks_is_flagged_with_its_share():
     fine = plain_industrial().with_values({"feed.top_size": "8 mm", "strength.scatter": INF})
     ds = simulate(fine)
@@ -284,14 +269,6 @@ def test_fragment_exponents_that_are_held_are_flagged_with_the_parents():
     assert "is held at 0.05 for parents of" in ds.attrs["diagnostics"]
     assert "and 5 for parents of 60 mm" in ds.attrs["diagnostics"]
     assert "fragment_exponent_held" not in flags(simulate(paper({"fragments.size_exponent": 0.1})))
-
-
-def test_tension_is_flagged():
-    ds = simulate(paper({"resolution.cells": 0, "elasticity.exponent": -0.5}))
-    assert {"tension_clamped", "no_limit_of_steps"} <= flags(ds)
-    assert "need not converge" in ds.attrs["diagnostics"]
-    assert "no_limit_of_steps" not in flags(simulate(paper({"resolution.cells": 0, "elasticity.exponent": 0.0})))
-    assert np.all(ds["pressure"] >= 0)
 
 
 def test_grains_below_the_floor_are_counted_and_flagged():

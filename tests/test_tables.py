@@ -69,8 +69,9 @@ def test_unreadable_tables_are_refused_with_line_and_format(tmp_path, text, word
 
 def test_missing_file_is_an_os_error_and_the_feeds_fault(tmp_path):
     path = tmp_path / "none.csv"
-    with pytest.raises(OSError, match=r"none\.csv"):
-        tables.read_sieve_table(path)
+    for read in (tables.read_sieve_table, lambda path: tables.read_pilot_tests(path, path)):
+        with pytest.raises(OSError, match=r"none\.csv"):
+            read(path)
     with pytest.raises(ValueError, match=r"the file cannot be read \(No such file"):
         TableFeed(table=path)
 
@@ -114,15 +115,15 @@ def test_shipped_pilot_tests_are_the_published_ones():
 
 
 def test_tests_of_a_minimal_table_leave_the_rest_unmeasured(tmp_path):
-    [test] = read_tests(tmp_path, "test,size_mm,feed,total\nA,1,10,35\nA,4,100,100\n", "test,U_m_s,Fsp_N_mm2\nA,1,2\n")
-    assert [math.isnan(value) for value in test[3:11]] == [True] * 8
+    product, operations = (
+        "test,size_mm,feed,total\nA,1,10,35\nA,4,100,100\n",
+        "test,U_m_s,Fsp_N_mm2,moisture_pct\nA,1,2,0\n",
+    )
+    [test] = read_tests(tmp_path, product, operations)
+    assert [math.isnan(value) for value in test[3:10]] == [True] * 7
+    assert test.moisture == 0.0  # dry, which is measured
     assert all(math.isnan(value) for value in (*test.centre, *test.edge))
     assert test.total == pytest.approx([0.35, 1.0])
-
-
-def test_a_dry_test_has_no_moisture(tmp_path):
-    [test] = read_tests(tmp_path, operations="test,U_m_s,Fsp_N_mm2,moisture_pct\nA,1,2,0\n")
-    assert test.moisture == 0.0
 
 
 def test_nothing_is_derived_and_single_empty_cells_stay_nan(tmp_path):
@@ -189,6 +190,7 @@ def test_arrays_of_a_test_are_read_only(tmp_path):
         (",total", ",Total", "did you mean 'total'?"),
         (",total", ",Total", "column 'total' is missing"),
         ("centre", "feed", "got column 'feed' 2 times"),
+        (PRODUCT, "test,size_mm,feed,total\nA,4,100,100\n", "line 2, test: got 1 sieve for A; must be at least two"),
     ],
 )
 def test_impossible_products_are_refused(tmp_path, old, new, words):
@@ -228,16 +230,6 @@ def test_faults_of_both_files_come_at_once_and_only_once(tmp_path):
     assert len(faults) == 5
     for fault, words in zip(faults, ("centre", "U_m_s", "Fsp_N_mm2", "test 'B'", "90"), strict=True):
         assert words in fault
-
-
-def test_a_single_sieve_is_no_distribution(tmp_path):
-    [fault] = refused(tmp_path, "test,size_mm,feed,total\nA,4,100,100\n")
-    assert "line 2, test: got 1 sieve for A; must be at least two" in fault
-
-
-def test_missing_pilot_table_is_an_os_error(tmp_path):
-    with pytest.raises(OSError, match=r"none\.csv"):
-        tables.read_pilot_tests(tmp_path / "none.csv", write(tmp_path / "o.csv", OPERATIONS))
 
 
 @pytest.mark.parametrize(

@@ -161,13 +161,6 @@ def test_domain_is_the_bed():
     assert high_y == pytest.approx(rim[0], rel=1e-12)
 
 
-def test_volumes_do_not_depend_on_speed():
-    slow, fast = scene_of(), scene_of().with_values({"rolls.speed": 2 * scene_of().rolls.speed})
-    one, other = tiled(slow)[1], tiled(fast)[1]
-    for name in ("volume", "pairs", "length", "normal", "distance"):
-        assert np.array_equal(getattr(one, name), getattr(other, name))
-
-
 # --- refused -----------------------------------------------------------------------------------------------
 
 

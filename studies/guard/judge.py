@@ -185,7 +185,7 @@ def catalogue() -> list[Row]:
         Row("n = inf, closed form", {"strength.cushioning": inf} | closed, "flagged", "size_floor_reached"),
         Row("gamma of 0.001", {"fragments.exponent": 1e-3}, "flagged", "size_floor_reached"),
         Row("hundreds of breaks", hundreds, "flagged", "size_floor_reached"),
-        Row("c below 0", {"elasticity.exponent": -0.5}, "flagged", "tension_clamped"),
+        Row("c below 0", {"elasticity.exponent": -0.5}, "flagged", "tension_clamped", "no_limit_of_steps"),
         Row("c below 0, Euler", {"elasticity.exponent": -0.5} | euler, "flagged", "tension_clamped"),
         Row("largest grain of 1.4 gaps", {"feed.top_size": 0.084}, "ok"),
         Row("swap sum below 1/2", {"exchange": {"segregation": 1e-3, "mixing": 1e-3}}, "ok"),
