@@ -10,7 +10,7 @@ import numbers
 import operator
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self, get_args
 
@@ -64,9 +64,23 @@ def show(value: float, unit: str, digits: int = 6) -> str:
 
 @cache
 def _registry():
-    import pint  # late: building the registry costs 0.2 s that plain numbers need not pay
+    import pint
 
     return pint.UnitRegistry()
+
+
+@lru_cache
+def _factor(named: str, known: Unit) -> float:
+    """Return how many SI units one of the unit `named` is; ValueError if it has another dimension."""
+    if named in (known.pint, known.shown):
+        return 1.0 if named == known.pint else 1 / known.factor
+    from pint.errors import PintError  # late: with its registry 0.3 s, that numbers and usual units need not pay
+
+    try:
+        return float((1.0 * _registry().Unit(named)).to(known.pint).magnitude)
+    except (PintError, ArithmeticError, AttributeError, TypeError, ValueError, AssertionError) as error:
+        fault = _FAULTS.get(type(error).__name__, "does not make a number")
+        raise ValueError(f"not a quantity in {known.shown}: its unit {named!r} {fault}") from None
 
 
 def parse(text: str, unit: str) -> float:
@@ -77,8 +91,6 @@ def parse(text: str, unit: str) -> float:
     ValueError
         If the text is not one number and its unit, or the unit has another dimension.
     """
-    from pint.errors import PintError
-
     known = UNITS[unit]
     found = _QUANTITY.fullmatch(text)
     if not found:
@@ -90,11 +102,7 @@ def parse(text: str, unit: str) -> float:
         named = "rpm" if named in _TURNS else named
         if not _ANGLE.search(named):
             raise ValueError("not a rate of turning; write it like '19 rpm' or '2 rad/s'")
-    try:
-        magnitude = float((number * _registry().Unit(named)).to(known.pint).magnitude)
-    except (PintError, ArithmeticError, AttributeError, TypeError, ValueError, AssertionError) as error:
-        fault = _FAULTS.get(type(error).__name__, "does not make a number")
-        raise ValueError(f"not a quantity in {known.shown}: its unit {named!r} {fault}") from None
+    magnitude = number * _factor(named, known)
     return float(f"{magnitude:.15g}")  # "13 mm" is the float 0.013, not its neighbour that 13 times 1e-3 gives
 
 

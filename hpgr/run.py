@@ -4,19 +4,21 @@ Not simulate.py: importing a module of that name would replace the function `hpg
 """
 
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import xarray as xr
 
 from hpgr import __version__, cost
 from hpgr.bed import machine
 from hpgr.bed.loaded import Beds, LoadedBed, inputs_of
 from hpgr.fields import check_number, check_seed
 from hpgr.grains import solve
-from hpgr.results import flags, metrics, schema
+from hpgr.results import flags, schema
 from hpgr.scene import Scene, check_scene
 from hpgr.tolerance import refine
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 _LAST = Beds(1)  # a bed costs 0.5 ms, and calls that differ in seed, feed or ore alone have the same
 _KEPT = 100_000  # points of a bed at most for it to be kept, which takes some 20 MB
@@ -75,7 +77,7 @@ def run_together(
 
 
 def _results(scene: Scene, bed: LoadedBed, products: list[solve.Crushed | None]) -> list[Result]:
-    throughput = metrics.gap_throughput(scene, float(bed.stress.solid_fraction[:, -1].mean()))
+    throughput = machine.gap_throughput(scene, float(bed.stress.solid_fraction[:, -1].mean()))
     performance = machine.performance(scene, bed.pressed, throughput)
     of_bed = _fields(bed) | _summaries(scene, bed) | performance._asdict() | {"throughput": throughput}
     limits = flags.diagnose(scene, bed, performance, products)
@@ -94,7 +96,7 @@ def _results(scene: Scene, bed: LoadedBed, products: list[solve.Crushed | None])
 
 def simulate(
     scene: Scene, seed: int = 0, replicate: int = 0, tolerance: float | None = None, max_cost: float = 60.0
-) -> xr.Dataset:
+) -> "xr.Dataset":
     """Simulate the steady machine of `scene`.
 
     Parameters

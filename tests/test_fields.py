@@ -2,6 +2,7 @@ import contextlib
 import math
 from fractions import Fraction
 
+import pint
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -99,6 +100,16 @@ def test_values_are_shown_in_the_unit_people_use():
     assert show(0.5, "1") == "0.5"
     assert show(2650.0, "kg m-3") == "2650 kg m-3"
     assert show(math.inf, "m") == "inf mm"
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_usual_units_are_those_of_pint(unit):
+    """They are read without its registry, which takes long to build."""
+    known, registry = UNITS[unit], pint.UnitRegistry()
+    for named in {known.shown, known.pint} - {"kg m-3", "kN m"}:  # which are not read
+        for number in (1.0, 0.7, 14.96, 19.0, 1140.0):
+            wanted = registry.Quantity(number, named).to(known.pint).magnitude
+            assert parse(f"{number} {named}", unit) == float(f"{wanted:.15g}")
 
 
 def test_examples_of_units_are_read():

@@ -14,7 +14,6 @@ from hpgr import Scene, operating_gap, simulate
 from hpgr.bed import machine
 from hpgr.bed.loaded import Beds, Pressed, bear, inputs_of, load_bed
 from hpgr.laws.flow import NipFlow, PowerFlow
-from hpgr.results import metrics
 
 SMALL = {"resolution.cells": 0, "resolution.points": 101, "resolution.streamlines": 4, "resolution.record": "product"}
 
@@ -30,7 +29,7 @@ def industrial(values=None):
 def performance(scene):
     """The machine's figures in double precision."""
     bed = load_bed(inputs_of(scene))
-    throughput = metrics.gap_throughput(scene, float(bed.stress.solid_fraction[:, -1].mean()))
+    throughput = machine.gap_throughput(scene, float(bed.stress.solid_fraction[:, -1].mean()))
     return machine.performance(scene, bed.pressed, throughput)
 
 

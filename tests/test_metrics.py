@@ -3,7 +3,7 @@ import pytest
 from support import paper, sized
 
 from hpgr import passing, peak_pressure, percentile_size, reduction_ratio, simulate, throughput
-from hpgr.results import metrics
+from hpgr.bed import machine
 
 
 def run(record, values=None):
@@ -163,7 +163,7 @@ def test_throughput_is_that_of_the_formula(product):
     assert tubes.values == pytest.approx(by_hand / 3, rel=1e-6)
     assert tubes.attrs["units"] == "kg s-1"
     scene = paper({"rolls.width": 0.5, "rolls.gap": 0.03, "bed.solid_density": 1000})
-    assert metrics.gap_throughput(scene, 0.7) == pytest.approx(1000 * 0.7 * 0.03 * 0.5 * 5.96903, rel=1e-6)
+    assert machine.gap_throughput(scene, 0.7) == pytest.approx(1000 * 0.7 * 0.03 * 0.5 * 5.96903, rel=1e-6)
 
 
 def test_peak_pressure_is_the_largest_of_the_field(product):

@@ -8,8 +8,8 @@ import pytest
 from support import paper, plain_industrial, plain_pilot
 
 from hpgr import Scene, simulate
+from hpgr.bed import machine
 from hpgr.bed.loaded import inputs_of, load_bed
-from hpgr.results import metrics
 from studies.sweep import sweep
 
 SMALL = {"resolution.points": 101, "resolution.streamlines": 5, "resolution.cells": 60, "resolution.record": "product"}
@@ -34,7 +34,7 @@ def pressed(request):
 def throughput_of(scene):
     """Throughput in double precision."""
     solid_fraction = load_bed(inputs_of(scene)).stress.solid_fraction
-    return metrics.gap_throughput(scene, float(solid_fraction[:, -1].mean()))
+    return machine.gap_throughput(scene, float(solid_fraction[:, -1].mean()))
 
 
 # --- throughput ---------------------------------------------------------------------------------------------

@@ -35,6 +35,12 @@ class Performance(NamedTuple):
     force_angle: float
 
 
+def gap_throughput(scene: Scene, exit_solid_fraction: float) -> float:
+    """Return the solids through the whole gap, Q = rho_s phi_exit s_b L U, kg/s."""
+    rolls = scene.rolls
+    return scene.bed.solid_density * exit_solid_fraction * rolls.gap * rolls.width * rolls.surface_speed
+
+
 def performance(scene: Scene, pressed: Pressed, throughput: float) -> Performance:
     """Return force, torque (of both drives), power and their specific figures for the whole roll width.
 

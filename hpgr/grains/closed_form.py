@@ -8,7 +8,7 @@ step, the closed forms as often as it takes.
 
 import math
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from hpgr.laws.feed import Feed
 from hpgr.laws.fragments import Fragments
 from hpgr.laws.strength import Strength
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(200)  # made once: they cost more than the rest of a case
+_nodes = cache(np.polynomial.legendre.leggauss)  # they cost more than the rest of a case
 _PARTS = 16  # that an interval is divided into while searching
 _FINEST = 1e-30  # m, below any grain; where percentiles are searched from
 _CLASSES = 30  # per factor e in size; passing is then right to 1e-4
@@ -145,7 +145,8 @@ def expected_breaks(feed: Feed, critical, gamma: float) -> np.ndarray:
     critical, largest = np.asarray(critical, dtype=float), feed.largest_grain
     start = np.log(np.minimum(critical, largest))
     length = np.log(largest) - start
-    size = np.exp(start[..., None] + length[..., None] * (_NODES + 1) / 2)
-    tail = (1 - feed.passing(size)) @ (_WEIGHTS / 2) * length
+    nodes, weights = _nodes(200)
+    size = np.exp(start[..., None] + length[..., None] * (nodes + 1) / 2)
+    tail = (1 - feed.passing(size)) @ (weights / 2) * length
     breaks = 1 - feed.passing(np.minimum(critical, largest)) + gamma * tail
     return np.where(critical <= largest, breaks, 0.0)

@@ -183,12 +183,6 @@ def scene_of(dataset: xr.Dataset) -> Scene:
         raise ValueError("attribute scene: is no scene as JSON; give a file that a study has written") from None
 
 
-def gap_throughput(scene: Scene, exit_solid_fraction: float) -> float:
-    """Return the solids through the whole gap, Q = rho_s phi_exit s_b L U, kg/s."""
-    rolls = scene.rolls
-    return scene.bed.solid_density * exit_solid_fraction * rolls.gap * rolls.width * rolls.surface_speed
-
-
 def _sizes(sieves) -> np.ndarray:
     given = [sieves] if isinstance(sieves, str) else np.atleast_1d(np.asarray(sieves, dtype=object)).tolist()
     try:

@@ -3,14 +3,16 @@
 from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import xarray as xr
 
 from hpgr import __version__
 from hpgr.results import flags
 from hpgr.scene import field_info
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 _LIBRARIES = ("numpy", "numba", "scipy", "shapely", "xarray", "netCDF4", "dask", "distributed")
 
@@ -173,11 +175,13 @@ def _version(library: str) -> str:
         return "unknown"
 
 
-def to_dataset(values: Mapping[str, Any], attrs: Mapping[str, Any], own: Mapping[str, Variable] = {}) -> xr.Dataset:
+def to_dataset(values: Mapping[str, Any], attrs: Mapping[str, Any], own: Mapping[str, Variable] = {}) -> "xr.Dataset":
     """Return arrays by name as a labelled Dataset, None left out; KeyError if a name is in no table.
 
     `own` has the variables of a study that no simulation has; one along a dimension of its own name is a coordinate.
     """
+    import xarray as xr  # late: 0.4 s that a sweep's cases and a machine's gap need not wait for
+
     table = {**COORDINATES, **VARIABLES, **SWEEP, **own}
     given = {name: value for name, value in values.items() if value is not None}
     data = [name for name in given if name not in COORDINATES and name not in table[name].dims]

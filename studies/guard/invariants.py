@@ -11,10 +11,11 @@ import numpy as np
 import xarray as xr
 from pydantic import ValidationError
 
+from hpgr.bed import machine
 from hpgr.fields import faults_of
 from hpgr.grains import kernels, march
 from hpgr.grains.lattice import MOST_SUBSTEPS
-from hpgr.results import flags, metrics
+from hpgr.results import flags
 from hpgr.scene import Scene
 
 _ROUNDING = 2.0**-22  # relative; a float32 is good to 2**-24, a quotient or mean of some to a few of that
@@ -143,7 +144,7 @@ def _solid_fraction(scene: Scene, result: Result):
 @_invariant("throughput")
 def _throughput(scene: Scene, result: Result):
     found = float(result["throughput"])
-    wanted = metrics.gap_throughput(scene, float(result["solid_fraction"][:, -1].mean(dtype=float)))
+    wanted = machine.gap_throughput(scene, float(result["solid_fraction"][:, -1].mean(dtype=float)))
     yield found > 0, f"throughput is {found:g}"
     yield abs(found - wanted) <= _ROUNDING * wanted, f"throughput is {found:g}, but rho phi s L U is {wanted:g}"
 
