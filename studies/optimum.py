@@ -373,16 +373,8 @@ def main(options: Options) -> Report:
     for text in options.subject_to:
         name = re.split("[<>]=", text)[0]
         bounds.setdefault(name.strip(), []).append(text[len(name) :])
-    best = optimise(
-        line.base_scene(options),
-        line.ranges(options.vary),
-        options.minimise,
-        options.maximise,
-        bounds,
-        options.seed,
-        threads=options.workers,
-        progress=True,
-    )
+    scene, over, run = line.base_scene(options), line.ranges(options.vary), {"threads": options.workers}
+    best = optimise(scene, over, options.minimise, options.maximise, bounds, options.seed, progress=True, **run)
     from studies.show.plots.optimum import optimum_figure
 
     def write(path: Path, history: str) -> None:

@@ -12,19 +12,8 @@ from studies.convergence import jackknife, observed_order, pareto, richardson
 from studies.show import accuracy_tables as tables
 from studies.show.plots.accuracy import accuracy_figure
 
-TINY = accuracy.Plan(
-    held=(2, 26, 24),
-    points=(11, 21, 41),
-    many_cells=24,
-    streamlines=(1, 2, 4),
-    streamline_cells=16,
-    cells=(4, 8, 16, 32),
-    snapshots=(1, 2, 4),
-    snapshot_cells=8,
-    grid=((2,), (11, 21), (8, 16)),
-    levels=(),
-    reference=(3, 32),
-    replicates=4,
+TINY = accuracy.Plan((2, 26, 24), (11, 21, 41), 24, (1, 2, 4), 16, (4, 8, 16, 32), (1, 2, 4), 8)._replace(
+    grid=((2,), (11, 21), (8, 16)), levels=(), reference=(3, 32), replicates=4
 )
 
 

@@ -11,31 +11,10 @@ import pytest
 import hpgr
 
 PACKAGE = Path(hpgr.__file__).parent
-ROOMS = [
-    {"fields"},
-    {"tables"},
-    {"laws"},
-    {"scene"},
-    {"bed"},
-    {"grains"},
-    {"results"},
-    {"cost"},
-    {"tolerance"},
-    {"run"},
-]
-LEVELS = {room: level for level, rooms in enumerate(ROOMS) for room in rooms} | {"presets": 4}
-WRITERS = {
-    "write_text",
-    "write_bytes",
-    "to_netcdf",
-    "to_zarr",
-    "to_csv",
-    "save",
-    "savez",
-    "savetxt",
-    "savefig",
-    "mkdir",
-}
+ROOMS = ["fields", "tables", "laws", "scene", "bed", "grains", "results", "cost", "tolerance", "run"]  # lowest first
+LEVELS = {room: level for level, room in enumerate(ROOMS)} | {"presets": 4}
+WRITERS = {"write_text", "write_bytes", "to_netcdf", "to_zarr", "to_csv", "mkdir"}
+WRITERS |= {"save", "savez", "savetxt", "savefig"}
 
 
 def sources(folder):

@@ -18,14 +18,8 @@ from studies.show.plots import extremes as plots
 
 INF = math.inf
 KNOWN = ranges.numeric_fields()
-COSTLY = {
-    "elasticity.substeps",
-    "exchange.segregation",
-    "exchange.mixing",
-    "resolution.streamlines",
-    "resolution.points",
-    "resolution.cells",
-}
+COSTLY = {"elasticity.substeps", "exchange.segregation", "exchange.mixing"}
+COSTLY |= {"resolution.streamlines", "resolution.points", "resolution.cells"}
 
 
 # --- the catalogue, row by row, and each field to its ends -------------------------------------------------------

@@ -193,17 +193,8 @@ def test_driver_that_waits_says_for_whom_and_takes_over_from_the_silent(base, cl
 
 @pytest.mark.slow
 def test_interrupt_ends_in_one_line_and_the_same_command_goes_on(tmp_path):
-    command = [
-        sys.executable,
-        "-m",
-        "studies.gap_sweep",
-        "--gap",
-        "40 mm",
-        "60 mm",
-        "--replicates",
-        "5000",
-        "--no-plot",
-    ]
+    options = ["--gap", "40 mm", "60 mm", "--replicates", "5000", "--no-plot"]
+    command = [sys.executable, "-m", "studies.gap_sweep", *options]
     heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # what is started in the background may ignore it
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, preexec_fn=heard) as driver:
         while not list(tmp_path.rglob("*.seg")):
