@@ -101,14 +101,9 @@ def test_refused(client, asked, words):
 
 
 def test_a_scene_file_gives_the_scene_back(tmp_path):
+    extra = {"roll_width": {}, "resolution.record": "product", "remark": 'a "quoted" µ'}
     for name in hpgr.presets.NAMES:
-        extra = {
-            "roll_width": {},
-            "resolution.record": "product",
-            "strength.cushioning": float("inf"),
-            "remark": 'a "quoted" µ',
-        }
-        scene = hpgr.Scene.preset(name).with_values(extra)
+        scene = hpgr.Scene.preset(name).with_values(extra | {"strength.cushioning": float("inf")})
         (tmp_path / "scene.toml").write_text(as_toml(scene), encoding="utf-8")
         assert hpgr.Scene.from_file(tmp_path / "scene.toml") == scene
 

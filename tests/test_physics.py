@@ -156,12 +156,6 @@ def test_coarser_feed_gives_a_slightly_finer_product_at_the_same_pressure():
     assert np.all(np.diff(result["breaks_per_cell"].mean("streamline")) > 0)
 
 
-@each_real
-def test_product_is_finer_in_the_middle_of_the_roll_width(preset):
-    found = simulate(real(preset, {"roll_width": {}}))
-    assert float(found["p80_width_centre"]) < float(found["p80_total"]) < float(found["p80_width_edge"])
-
-
 def test_softer_ore_is_crushed_finer_by_the_same_machine():
     strengths = plain_pilot().strength.reference_strength * np.array([0.5, 1.0, 2.0])
     result = sweep(real(plain_pilot), {"strength.reference_strength": strengths}, threads=1).isel(replicate=0)

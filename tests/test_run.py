@@ -131,40 +131,6 @@ def test_distributions_hold_all_mass_at_every_point():
     assert finer.values.min() >= -1e-6  # grains only get finer
 
 
-# --- the paper's shape -------------------------------------------------------------------------------------
-
-
-def test_product_is_finer_at_mid_gap_than_at_the_roll():
-    """The two differ by 10 % where a percentile scatters by 1 / sqrt(M): more than 5 sigma apart."""
-    ds = simulate(
-        paper(
-            {
-                "resolution.streamlines": 10,
-                "resolution.points": 201,
-                "resolution.cells": sized(20_000, 500),
-                "resolution.record": "product",
-                "resolution.snapshots": sized(1, 10),
-            }
-        )
-    )
-    for name in ("p50", "p80"):
-        assert ds[name].values[0] < ds[name].values[-1]
-        assert ds[name].values[:3].mean() < ds[name].values[-3:].mean()
-    peaks = ds["streamline_peak_pressure"].values
-    assert np.all(np.diff(peaks) < 0)
-    assert ds["p80_total"] < 0.1 * 0.06
-
-
-def test_narrower_gaps_press_harder_and_grind_finer():
-    def figures(gap):
-        ds = simulate(paper({"rolls.gap": gap, "resolution.cells": 500, "resolution.record": "product"}))
-        return float(ds["peak_pressure"]), float(ds["p80_total"])
-
-    found = np.array([figures(gap) for gap in (0.04, 0.06, 0.09)])
-    assert np.all(np.diff(found[:, 0]) < 0)
-    assert np.all(np.diff(found[:, 1]) > 0)
-
-
 # --- bit-exact relations -----------------------------------------------------------------------------------
 
 SIZES = ("size", "breaks_per_cell", "below_floor")

@@ -5,7 +5,7 @@ import pint
 import pytest
 from support import paper
 
-from hpgr import Scene, presets, simulate
+from hpgr import presets, simulate
 from hpgr.results import flags, schema
 
 TABLE = schema.COORDINATES | schema.VARIABLES
@@ -51,19 +51,6 @@ def test_names_are_short_enough_for_an_axis_and_units_are_read_by_pint():
         assert entry.attributes().keys() >= ({"long_name", "units"} if entry.dtype is not object else {"long_name"})
         spelled = re.sub(r"([a-z])(-?\d)", r"\1^\2", entry.units).replace(" ", "*")
         registry.parse_units("" if spelled == "1" else spelled)
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"strength.cushioning": float("inf"), "strength.weibull_modulus": float("inf")},
-        {"feed": {"kind": "table", "table": ((0.001, 0.0), (0.05, 100.0))}},
-    ],
-    ids=["with inf", "with a table"],
-)
-def test_scene_attribute_rebuilds_the_scene(values):
-    scene = paper(values | {"resolution.cells": 0})
-    assert Scene.model_validate_json(simulate(scene).attrs["scene"]) == scene
 
 
 def test_flags_are_masks_with_meanings():

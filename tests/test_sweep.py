@@ -114,21 +114,6 @@ def test_bits_do_not_depend_on_threads_order_or_company(base, client):
     assert not np.array_equal(other["passing"], two["passing"])
 
 
-def test_speed_changes_throughput_and_power_only(base, client):
-    speed = 19 * np.pi / 30
-    result = sweep(base, {"rolls.speed": [speed, 2 * speed, 4 * speed, 1.37 * speed]}, 2, client=client)
-    for name in result.data_vars:
-        if name not in ("throughput", "power", "message", "diagnostics"):  # which tell of the speed
-            first = result[name].isel(roll_speed=0)
-            changed = [k for k in range(4) if not np.array_equal(result[name].isel(roll_speed=k), first)]
-            assert not changed, name
-    for name in ("throughput", "power"):  # in proportion to speed, by energy and mass per roll turn
-        flow = result[name].values
-        assert np.array_equal(flow[1], 2 * flow[0])  # doubling is exact in binary
-        assert np.array_equal(flow[2], 4 * flow[0])
-        assert flow[3] == pytest.approx(1.37 * flow[0], rel=2**-23)  # one rounding of float32
-
-
 def test_other_fields_as_axes(base, client):
     axes = {"strength.cushioning": [0.5, np.inf], "elasticity.integrator": ["increment", "euler"]}
     result = sweep(base, axes, client=client)
