@@ -117,7 +117,11 @@ def steady(scene: Scene, returned: Screen | EdgeRecycle, seed: int = 0, replicat
         residual = float(np.abs(outputs[-1] - inputs[-1]).sum())
         load = back.sum() / product.sum()
         if load > _MOST_LOAD or inputs[-1].sum() > 2 * _MOST_LOAD:
-            raise ValueError(_diverges(back))
+            coarse = show(float(_SIEVES[np.argmax(np.cumsum(back) >= 0.5 * back.sum())]), "m", 3)
+            raise ValueError(
+                f"recycle: got more than {100 * _MOST_LOAD:.0f} % of the fresh feed, and it grows: half of it is "
+                f"coarser than {coarse}, and the rolls break too little of that; cut coarser, or press harder"
+            )
         smooth, cells = result.solver == "closed form", scene.resolution.cells * scene.resolution.streamlines
         if residual <= (_CONVERGED if smooth else _CELLS * feed.sum() / cells):
             shared = (part * (1 + load) for part in (back, product))  # the last product: what goes in is what goes out
@@ -127,14 +131,6 @@ def steady(scene: Scene, returned: Screen | EdgeRecycle, seed: int = 0, replicat
     raise ValueError(
         f"recycle: got a change of {residual:.2g} of the fresh feed after {iteration} rounds; must settle; give more "
         "cells or streamlines"
-    )
-
-
-def _diverges(back: np.ndarray) -> str:
-    coarse = show(float(_SIEVES[np.argmax(np.cumsum(back) >= 0.5 * back.sum())]), "m", 3)
-    return (
-        f"recycle: got more than {100 * _MOST_LOAD:.0f} % of the fresh feed, and it grows: half of it is coarser than "
-        f"{coarse}, and the rolls break too little of that; cut coarser, or press harder"
     )
 
 

@@ -220,7 +220,9 @@ def _read_segment(path: Path, wanted: Callable[[str], bool], mend: "CaseFolder |
             while (start := file.tell()) < size:
                 header, arrays = read_packed(file)
                 if mend is not None:
-                    intact.append(_between(file, start))
+                    length = file.tell() - start
+                    file.seek(start)
+                    intact.append(file.read(length))
                 address = header.get("address")
                 if wanted(address) and _file_is_whole(path.with_name(f"{address}.nc"), header.get("file")):
                     yield Found(address, header, arrays)
@@ -230,12 +232,6 @@ def _read_segment(path: Path, wanted: Callable[[str], bool], mend: "CaseFolder |
         say(f"{path}: damaged at byte {start:,} of {size:,} ({error}); what it held from there on is computed again")
         if mend is not None:
             mend.set_aside(path, b"".join(intact))
-
-
-def _between(file: BinaryIO, start: int) -> bytes:
-    stop = file.tell()
-    file.seek(start)
-    return file.read(stop - start)
 
 
 def _file_is_whole(path: Path, checksum: str | None) -> bool:

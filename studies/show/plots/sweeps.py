@@ -143,7 +143,8 @@ def against_axis(panel, values: xr.DataArray, axis: xr.DataArray, heading: str) 
     groups, count = _alike(lines.values.reshape(lines.sizes["line"], -1)), lines.sizes["line"]
     for k in range(count):
         one = lines.isel(line=k)
-        bars, label = report.spread(one).values, _line_name(values, lines, others, k)
+        label = ", ".join(report.value_text(values[name], lines[name].values[k]) for name in others)
+        bars = report.spread(one).values
         style = _style(k, count) | {"color": str(0.6 * k / max(count - 1, 1))}
         style |= {} if dim == axis.name else {"linestyle": "none"}  # other fields vary along it too
         error = None if np.isnan(bars).all() else bars[order]
@@ -166,10 +167,6 @@ def against_axis(panel, values: xr.DataArray, axis: xr.DataArray, heading: str) 
 def _panel_title(heading: str) -> str:
     name = heading.partition(" [")[0]
     return {"W": "Specific energy"}.get(name, name[0].upper() + name[1:])
-
-
-def _line_name(values: xr.DataArray, lines: xr.DataArray, others: list[str], k: int) -> str:
-    return ", ".join(report.value_text(values[name], lines[name].values[k]) for name in others)
 
 
 def _alike(rows: np.ndarray) -> list[list[int]]:
