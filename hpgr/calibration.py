@@ -17,7 +17,7 @@ import numpy as np
 
 from hpgr.bed import machine
 from hpgr.bed.loaded import Beds
-from hpgr.fields import names_of, path_of, show
+from hpgr.fields import names_of, path_of, show, values_of
 from hpgr.grains import solve
 from hpgr.laws.feed import Feed, TableFeed
 from hpgr.laws.flow import NipFlow, cake_nip_angle, densest_ratio
@@ -342,7 +342,7 @@ class _Problem:
             if name not in _MACHINES or column == group:
                 values[parameter.field] = parameter.value(float(number))
                 if parameter.follower:
-                    ratio = _field(self.scene, parameter.follower) / _field(self.scene, parameter.field)
+                    ratio = values_of(self.scene)[parameter.follower] / values_of(self.scene)[parameter.field]
                     values[parameter.follower] = ratio * values[parameter.field]
         return values
 
@@ -350,7 +350,7 @@ class _Problem:
         """Return the place to start from: beds that carry the tests' forces near their gaps."""
         started = {group: _started(self.scene, self.names, self.tests[group], self.feed) for group in set(self.groups)}
         return np.array(
-            [PARAMETERS[name].scaled(_field(started[group], PARAMETERS[name].field)) for name, group in self.columns]
+            [PARAMETERS[name].scaled(values_of(started[group])[PARAMETERS[name].field]) for name, group in self.columns]
         )
 
     def predict(self, place: np.ndarray, test: PilotTest) -> Prediction:
@@ -544,7 +544,7 @@ def _residuals(said: Prediction, test: PilotTest) -> dict[str, np.ndarray]:
 def _started(scene: Scene, names: Sequence[str], test: PilotTest, feed: Feed | None) -> Scene:
     """Return the scene with starting values that a test tells by itself: moduli that carry its force, and strength."""
     for name in ("k", "n"):
-        if name in names and math.isinf(_field(scene, PARAMETERS[name].field)):
+        if name in names and math.isinf(values_of(scene)[PARAMETERS[name].field]):
             scene = scene.with_values({PARAMETERS[name].field: 1.0})
     here = _at_test(scene, test, feed)
     rolls, bed = here.rolls, here.bed
@@ -565,7 +565,7 @@ def _started(scene: Scene, names: Sequence[str], test: PilotTest, feed: Feed | N
             if not 0 < force < math.inf:
                 break
             factor = test.specific_pressing_force / force
-            stiffer = {one: factor * _field(here, one) for one in (PARAMETERS["K"].field, PARAMETERS["K"].follower)}
+            stiffer = {one: factor * values_of(here)[one] for one in (PARAMETERS["K"].field, PARAMETERS["K"].follower)}
             scene, here = scene.with_values(stiffer), here.with_values(stiffer)
     if "sigma_m" in names:
         pressure = float(solve.crushing_stress(*load(here)).max())
@@ -607,8 +607,3 @@ def _known_names(scene: Scene, fit: Sequence[str] | None) -> list[str]:
         if lacking.get(name):
             raise ValueError(f"fit: got {name}; must be fitted with {lacking[name]}; leave it out, or change the scene")
     return names
-
-
-def _field(scene: Scene, name: str) -> float:
-    part, key = name.split(".")
-    return getattr(getattr(scene, part), key)
