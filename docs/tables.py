@@ -4,7 +4,7 @@ import inspect
 from collections.abc import Iterable
 from typing import Any, get_args
 
-from hpgr.fields import kinds_of, parts_of, show
+from hpgr.fields import kinds_of, meanings, parts_of, show
 from hpgr.results import flags, schema
 from hpgr.scene import Scene
 
@@ -33,16 +33,19 @@ def scene_fields() -> str:
         for part in parts_of(holder):
             kind = "".join(f", kind `{kind}`" for kind in kinds_of(part))
             about = inspect.getdoc(part).split("\n\n")[0].replace("``", "`").replace("\n", " ")
-            rows = [field_row(f"{section}.{key}", field) for key, field in part.model_fields.items() if key != "kind"]
+            rows = [
+                field_row(f"{section}.{key}", field, meanings(part)[key])
+                for key, field in part.model_fields.items()
+                if key != "kind"
+            ]
             parts += [f"### `{section}`{kind}", about, table(heads, rows)]
     return "\n\n".join(parts)
 
 
-def field_row(name: str, field: Any) -> list[str]:
+def field_row(name: str, field: Any, meaning: str) -> list[str]:
     """Return what the table says of one field."""
     extra = field.json_schema_extra or {}
     unit, symbol = extra.get("unit", "1"), extra.get("symbol")
-    meaning = " ".join(field.description.split())
     shown = [f"`{name}`", f"`{symbol}`" if symbol else "", unit.replace("1", "") if unit == "1" else unit]
     return [*shown, default(field, unit), bounds(field), meaning, extra.get("source", "")]
 

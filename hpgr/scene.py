@@ -27,6 +27,7 @@ from hpgr.fields import (
     RadiansPerSecond,
     fault_in_words,
     kinds_of,
+    meanings,
     parse,
     parts_of,
     path_of,
@@ -509,10 +510,10 @@ def field_info(name: str) -> FieldInfo:
     ValueError
         If a scene has no such field; the message lists the closest names.
     """
-    _, field = _find_field(name)
-    extra = field.json_schema_extra or {}
-    text = re.split("[;:]", " ".join(field.description.split()).rstrip("."))[0]
-    return FieldInfo(extra.get("unit", "1"), extra.get("symbol", name.rpartition(".")[2]), text)
+    part, field = _find_field(name)
+    key, extra = name.rpartition(".")[2], field.json_schema_extra or {}
+    text = re.split("[;:]", meanings(part)[key].rstrip("."))[0]
+    return FieldInfo(extra.get("unit", "1"), extra.get("symbol", key), text)
 
 
 def field_value(name: str, value: Any) -> Any:

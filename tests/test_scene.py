@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from support import paper
 
 from hpgr import Resolution, Rolls, Scene, presets
-from hpgr.fields import kinds_of, parts_of
+from hpgr.fields import kinds_of, meanings, parts_of
 from hpgr.scene import field_info, field_value, levels
 
 INF = math.inf
@@ -509,9 +509,10 @@ def test_with_values_lists_every_fault():
 
 
 def test_every_field_is_described_and_every_number_carries_symbol_unit_source_and_example():
-    assert all(part.description for part in Scene.model_fields.values())
+    assert meanings(Scene).keys() == Scene.model_fields.keys()
+    for laws in map(parts_of, Scene.model_fields.values()):
+        assert all(law.model_fields.keys() - {"kind"} <= meanings(law).keys() for law in laws)
     for name, field in FIELDS.items():
-        assert field.description, name
         if field.json_schema_extra:
             assert field.json_schema_extra["source"]
             assert field.json_schema_extra["example"] is not None
