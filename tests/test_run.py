@@ -341,6 +341,31 @@ def test_substeps_refine_the_stress_and_keep_the_points(values):
     assert np.array_equal(refined["continuity_solid_fraction"], fine["continuity_solid_fraction"])
 
 
+# --- what scenes share ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("base", [paper(), plain_industrial()], ids=["paper", "industrial"])
+def test_scenes_that_run_together_come_to_what_they_come_to_alone(base):
+    """Each field of a scene in turn is another by a tenth: what one has must not be taken for the other's."""
+    base = base.with_values({"resolution.record": "product", "strength.cushioning": 1.0})
+    numbers = {
+        name: value for name, value in values_of(base).items() if isinstance(value, float) and math.isfinite(value)
+    }
+    others = {"strength.stress": "major", "strength.scatter": 2.0, "rolls.specific_pressing_force": 3e6}
+    scenes = [base]
+    for name, value in ({name: 0.9 * value for name, value in numbers.items()} | others).items():
+        try:
+            scenes.append(base.with_values({name: value}))
+        except ValueError:  # no scene, such as of a negative exponent
+            continue
+    assert len(scenes) > 15
+    together = [result for [result] in run_together([(scene, [0]) for scene in scenes], 0)]
+    for scene, one in zip(scenes, together, strict=True):
+        alone = run_scene(scene)
+        for name in ("passing_total", "p80_total", "peak_pressure", "power", "flags"):
+            assert np.array_equal(one.values[name], alone.values[name]), (name, scene)
+
+
 # --- what is no argument ----------------------------------------------------------------------------------------
 
 PRODUCT, OPERATIONS = (hpgr.presets.DATA / f"khd_porphyry_{name}.csv" for name in ("psd", "operations"))

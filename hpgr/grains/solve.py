@@ -119,8 +119,8 @@ class Loaded(NamedTuple):
 def crush(points: Iterable[Loaded], seed: int) -> list[list[Crushed | None]]:
     """Crush the feed of each scene in its bed, once for every replicate; None for a stress-only scene.
 
-    Neighbours that differ by feed and load alone share calls of the kernels, and replicates what is known without
-    random numbers. `seed` is the key of the randomness, with the replicates.
+    Neighbours that differ by feed, load and reference strength alone share calls of the kernels, and replicates what is
+    known without random numbers. `seed` is the key of the randomness, with the replicates.
     """
     found: list[list[Crushed | None]] = []
     for together, group in itertools.groupby(points, lambda one: _marched_with(one.scene)):
@@ -155,8 +155,8 @@ def _crush_alone(point: Loaded, seed: int) -> list[Crushed | None]:
 
 def _crush_together(points: list[Loaded], seed: int) -> list[list[Crushed]]:
     scenes, slices = [one.scene for one in points], _slices(points[0].scene)
-    grid, strength = scenes[0].resolution, scenes[0].strength
-    log_stress = strength.log_stress(np.stack([crushing_stress(one.scene, one.bed) for one in points]))
+    grid = scenes[0].resolution
+    log_stress = np.stack([one.scene.strength.log_stress(crushing_stress(one.scene, one.bed)) for one in points])
     complete = None
     if is_controlled(scenes[0]):
         complete = [_complete(*one, slices)[0] for one in zip(scenes, log_stress.max(axis=2)[:, None], strict=True)]
