@@ -62,7 +62,7 @@ def predict(scene: Scene) -> Cost:
         below = (
             1.0 if solver == "lattice" else 0.1
         )  # of parcels and steps, squared: the reduced lattice begins far down
-        seconds += 5e-5 * lines * points + below * steps * lines * points * (2e-6 + 3e-9 * cells)
+        seconds += 5e-5 * lines * points + below * steps * lines * points * (4e-7 + 3e-9 * cells)
     if cells and grid.record == "cells":
         size += 4 * frames * lines * points * cells
         seconds += 1e-9 * frames * lines * points * cells
