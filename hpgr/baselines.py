@@ -373,9 +373,7 @@ def _least_squares(model, tests, kind) -> Fit:
         """Return model minus measurement in percent passing wherever there is one."""
         found = parameters(vector)
         pairs = [(model.predict(found, test), test) for test in tests]
-        off = np.hstack(
-            [100 * (getattr(said, name) - getattr(test, name)) for said, test in pairs for name in PRODUCTS]
-        )
+        off = np.hstack([100 * (getattr(one, name) - getattr(test, name)) for one, test in pairs for name in PRODUCTS])
         return off[~np.isnan(off)]
 
     ends = (place_of(low), place_of(high))

@@ -279,9 +279,7 @@ def validated(found: Calibration) -> Calibration:
     return found._replace(discrepancy=discrepancy(pairs))
 
 
-def discrepancy(
-    pairs: Sequence[tuple[PilotTest, Prediction]], factor: float = 1.0, least: float = 0.0
-) -> dict[str, float]:
+def discrepancy(pairs: list[tuple[PilotTest, Prediction]], factor: float = 1.0, least: float = 0.0) -> dict[str, float]:
     """Return by quantity the standard deviation of measured tests about their predictions, as in `Calibration`.
 
     What the predictions' own intervals tell is taken off, at most three quarters of the variance.
@@ -325,9 +323,8 @@ class _Problem:
         self.scene, self.tests, self.names, self.feed = scene, tests, names, feed
         self._beds, self._found = Beds(_BEDS), {}
         self.groups = [next(k for k, other in enumerate(tests) if _one_machine(test, other)) for test in tests]
-        self.columns = [
-            (name, group) for name in names for group in (sorted(set(self.groups)) if name in _MACHINES else [0])
-        ]
+        groups = sorted(set(self.groups))
+        self.columns = [(name, group) for name in names for group in (groups if name in _MACHINES else [0])]
         self.labels = [name if group == 0 else f"{name} of {tests[group].name}" for name, group in self.columns]
         fitted = [PARAMETERS[name] for name, _ in self.columns]
         self.low = np.array([one.scaled(one.low) for one in fitted])

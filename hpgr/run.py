@@ -3,7 +3,7 @@
 Not simulate.py: importing a module of that name would replace the function `hpgr.simulate` by the module.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -64,9 +64,7 @@ def run_scene(scene: Scene, seed: int = 0, replicate: int = 0, beds: Beds | None
     return result
 
 
-def run_together(
-    points: Iterable[tuple[Scene, Sequence[int]]], seed: int, beds: Beds | None = None
-) -> list[list[Result]]:
+def run_together(points: list[tuple[Scene, Sequence[int]]], seed: int, beds: Beds | None = None) -> list[list[Result]]:
     """Run each scene once for every one of its replicates.
 
     Replicates share their bed and what is known of it; scenes that differ by feed and load alone share calls of the

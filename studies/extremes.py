@@ -76,10 +76,8 @@ def walk(scenes: int, seed: int = 0, every: int = 1, progress: bool = False) -> 
     ends = [(name, end) for name in known for end in known[name].ends()]
     ends += [(name, word) for name, words in ranges.choices().items() for word in words]
     listed = [("ends", f"{name} = {_text(end)}", values) for name, end in ends for values in hosts({name: end})]
-    outside = [(name, value) for name in known for value in known[name].outside()]
-    listed += [
-        ("outside", f"{name} = {_text(end, 17)}", values) for name, end in outside for values in hosts({name: end})[:1]
-    ]
+    beyond = [(name, value) for name in known for value in known[name].outside()]
+    listed += [("outside", f"{name} = {_text(end, 17)}", one) for name, end in beyond for one in hosts({name: end})[:1]]
     listed += [("pairs", name, values) for name, values in list(_pairs(known))[::every]]
     with cli.progress_bar(len(rows) + len(listed) + scenes, progress, "scenes") as bar:
         for row in rows:
@@ -158,10 +156,8 @@ def table(result: "xr.Dataset") -> str:
     from studies.show.report import aligned
 
     kinds, parts, bits = (result[name].values for name in ("outcome", "part", "flags"))
-    counts = (
-        [kinds[parts == part].size, *(((parts == part) & (kinds == k)).sum() for k in range(5))] for part in PARTS
-    )
-    rows = [[part, *map(str, row)] for part, row in zip(PARTS, counts, strict=True)]
+    found = ([kinds[parts == part].size, *(((parts == part) & (kinds == k)).sum() for k in range(5))] for part in PARTS)
+    rows = [[part, *map(str, row)] for part, row in zip(PARTS, found, strict=True)]
     messages = result["message"].values[kinds == KINDS.index("refused")]
     refused = Counter(str(message).partition(": ")[0] for message in messages)
     flagged = Counter({name: int((bits & bit > 0).sum()) for name, bit in flags.BITS.items()})

@@ -302,9 +302,7 @@ class _Search:
         """Return in words what is reached of each figure that has a bound."""
         every = np.array(list(self.known.values()))[:, self.bounded]
         ends = zip(self.limits, np.nanmin(every, axis=0).tolist(), np.nanmax(every, axis=0).tolist(), strict=True)
-        told = [
-            f"got {one}; {one.quantity.told(low)} to {one.quantity.told(high)} is reached" for one, low, high in ends
-        ]
+        told = [f"got {one}; {one.quantity.told(lo)} to {one.quantity.told(hi)} is reached" for one, lo, hi in ends]
         return "; ".join(told) + (", but not together," if len(told) > 1 else "")
 
     def judged(self, best: np.ndarray) -> dict[str, tuple[float, float]]:
@@ -313,10 +311,7 @@ class _Search:
         runs = self.run(best, range(first, first + self.judges))
         noise = 2 * runs.std(axis=1, ddof=1) / math.sqrt(self.judges) if self.judges > 1 else np.zeros(len(runs))
         every = np.eye(best.size)[[field in self.free for field in self.ends]]
-        near = [
-            best,
-            *np.clip(best + _RADIUS * np.vstack([every, -every]), 0, 1),
-        ]  # what is held was not, in the design
+        near = [best, *np.clip(best + _RADIUS * np.vstack([every, -every]), 0, 1)]  # what is held varied in the design
         here, *others = (self.run(unit, range(self.replicates)).mean(axis=1) for unit in near)
         errors = noise + np.nanmax(np.abs(np.array([here, *others]) - here), axis=0)
         return {one.words: (float(runs[k].mean()), float(errors[k])) for k, one in enumerate(self.every)}

@@ -62,9 +62,8 @@ def main(options: Options) -> cli.Report:
     result = study(scene, options.shown_points, options.seed, options.animation, options.assumptions)
     from studies.show.plots import paper as plots
 
-    figures = [
-        cli.figure(lambda draw=draw: draw(result), dpi=110) for draw in (plots.figure3, plots.figure4, plots.figure5)
-    ]
+    every = (plots.figure3, plots.figure4, plots.figure5)
+    figures = [cli.figure(lambda draw=draw: draw(result), dpi=110) for draw in every]
     animation = lambda path, history: plots.startup_animation(result, path, history)  # noqa: E731
     return cli.Report(findings(result), [result, *figures, animation])
 
@@ -347,9 +346,7 @@ def _assumption_table(result) -> str:
 
     columns = []
     for name, factor, form in (("peak_pressure", 1e-6, ".2f"), ("p80", 1e3, ".4g")):
-        inner, outer = (
-            factor * result[f"assumed_{name}_{where}"].values.astype(float) for where in ("mid_gap", "roll")
-        )
+        inner, outer = (factor * result[f"assumed_{name}_{side}"].values.astype(float) for side in ("mid_gap", "roll"))
         ratios = [f"{roll / middle:.3f}" if middle > 0 else "-" for middle, roll in zip(inner, outer, strict=True)]
         columns += [[format(one, form) for one in each] for each in (inner, outer)] + [ratios]
     headings = ["assumption", "peak pressure [MPa]: mid-gap", "roll", "ratio", "P80 [mm]: mid-gap", "roll", "ratio"]

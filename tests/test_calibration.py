@@ -38,9 +38,8 @@ def planted(names):
     scene = start()
     fields = {PARAMETERS[name].field: PLANTED[name] for name in names}
     if "K" in names:
-        fields["elasticity.shear_modulus"] = (
-            PLANTED["K"] * scene.elasticity.shear_modulus / scene.elasticity.bulk_modulus
-        )
+        law = scene.elasticity
+        fields["elasticity.shear_modulus"] = PLANTED["K"] * law.shear_modulus / law.bulk_modulus
     return scene.with_values(fields)
 
 

@@ -52,11 +52,8 @@ def test_scene_beyond_the_memory_is_refused_with_bytes_bound_and_remedy(monkeypa
         cost.refuse_too_large(scene)
     text = str(error.value)
     assert text.startswith("resolution.cells: got 64 cells x 61 points x 3 streamlines, recording cells")
-    for words in (
-        f"predicted {needed:,} bytes",
-        f"80% of the {needed:,} bytes that physical memory",
-        "record 'product'",
-    ):
+    held = f"80% of the {needed:,} bytes that physical memory"
+    for words in (f"predicted {needed:,} bytes", held, "record 'product'"):
         assert words in text
     monkeypatch.setattr(cost, "available_memory", lambda: (2 * needed, "physical memory"))
     cost.refuse_too_large(scene)

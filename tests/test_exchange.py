@@ -417,9 +417,8 @@ def test_a9_mean_sizes_follow_the_mean_field(scale):
     """
     cells = sized(20_000, 800)
     chances = scale * np.array([0.1, 0.25, 0.4, 0.05, 0.3, 0.15])
-    column = Column(
-        np.repeat([[2.0], [1.0], [1.0], [1.0], [1.0]], cells, axis=1), RING, mixing=chances, means=1.0, seed=5
-    )
+    boxes = np.repeat([[2.0], [1.0], [1.0], [1.0], [1.0]], cells, axis=1)
+    column = Column(boxes, RING, mixing=chances, means=1.0, seed=5)
     share = np.array([1.0, 0, 0, 0, 0])
     for _ in range(8):
         column.swap()

@@ -27,12 +27,8 @@ def refined(axes, replicates=2, base=None):
 @pytest.fixture(scope="module")
 def three():
     """Three axes, the first unsorted and with a value that is refused; diagnostics that are no safe HTML."""
-    axes = {
-        "rolls.gap": ["60 mm", "40 mm", "1.2 m"],
-        "feed.top_size": [0.03, 0.06],
-        "rolls.speed": ["10 rpm", "20 rpm"],
-    }
-    result = refined(axes)
+    speeds = {"rolls.speed": ["10 rpm", "20 rpm"]}
+    result = refined({"rolls.gap": ["60 mm", "40 mm", "1.2 m"], "feed.top_size": [0.03, 0.06]} | speeds)
     lose(result, "boom <b>", gap=1, feed_top_size=0, roll_speed=0, replicate=1)
     texts = result["diagnostics"].values.astype(object)
     texts[0, 0, 0, 0] = f"{texts[0, 0, 0, 0]}\n{NASTY}".strip()
@@ -143,11 +139,8 @@ def test_every_scalar_of_a_sweep_is_a_figure():
     result = swept("one")
     result["motor_power"] = result["throughput"] * 2.0
     result["motor_power"].attrs = {"units": "W", "long_name": "power of both motors"}
-    result["passes"] = (
-        result["status"].dims,
-        np.array([[1, 2], [4, 4]], np.int32),
-        {"units": "1", "long_name": "passes"},
-    )
+    passes = np.array([[1, 2], [4, 4]], np.int32)
+    result["passes"] = (result["status"].dims, passes, {"units": "1", "long_name": "passes"})
     lose(result, "boom", gap=0, replicate=0)
     kpis = {one["heading"]: one for one in page.page_data(result, 1e-3, "x")["kpis"]}
     agree(kpis["motor power [kW]"], flat(result, "motor_power") / 1e3)
@@ -290,9 +283,8 @@ def test_files_without_a_sweep_are_refused(refused, tmp_path):
     xr.Dataset({"a": 1}).to_netcdf(tmp_path / "other.nc")
     assert "the attribute scene" in refused("other.nc")
     netcdf.write_dataset(refined({"rolls.gap": ["1.2 m"]}), tmp_path / "lost.nc")
-    assert "lost.nc: no case holds a result, so there is nothing to show; the first: refused: gap 1200" in refused(
-        "lost.nc"
-    )
+    message = refused("lost.nc")
+    assert "lost.nc: no case holds a result, so there is nothing to show; the first: refused: gap 1200" in message
 
 
 def test_a_file_with_values_elsewhere_is_refused_unread(refused, tmp_path):

@@ -124,9 +124,8 @@ def test_power_is_that_of_plates_closing_on_the_bed():
         angle = math.radians(degrees)
         rise = 2.8 * (1 - math.cos(angle))  # to 1.4 gaps at the nip: a cake of 0.83
         rolls = {"rolls.diameter": 2.8, "rolls.gap": 2.5 * rise, "rolls.entry_gap": 4 * rise, "rolls.idle_torque": 0.0}
-        scene = pilot(
-            rolls | {"flow.nip_angle": angle, "resolution.points": 401, "feed": {"kind": "single", "size": 1e-3}}
-        )
+        feed = {"kind": "single", "size": 1e-3}
+        scene = pilot(rolls | {"flow.nip_angle": angle, "resolution.points": 401, "feed": feed})
         y, normal, _, _ = tube(scene, 1.0)
         bed = inputs_of(scene).between_rolls(np.ones(1))
         plates = -2 * scene.rolls.surface_speed * np.trapezoid(normal * bed.slope(y), y)
@@ -147,10 +146,8 @@ def test_identities_of_force_torque_power_and_energy(scene):
     """W = 2000 Fsp sin(beta) / mdot, with W in kWh/t, Fsp in N/mm2, mdot in t s/(h m3)."""
     bare = performance(scene.with_values({"rolls.idle_torque": 0.0}))
     mdot = bare.specific_throughput * 3.6  # kg/m3 is t s/(h m3) over 3.6
-    energy = bare.specific_energy / 3.6e6 * 1000
-    assert energy == pytest.approx(
-        2000 * bare.specific_pressing_force / 1e6 * math.sin(bare.force_angle) / mdot, rel=1e-12
-    )
+    energy, force = bare.specific_energy / 3.6e6 * 1000, bare.specific_pressing_force / 1e6
+    assert energy == pytest.approx(2000 * force * math.sin(bare.force_angle) / mdot, rel=1e-12)
     rolls = scene.rolls
     assert bare.torque * rolls.speed == pytest.approx(bare.power, rel=1e-14)
     assert bare.specific_pressing_force * rolls.diameter * rolls.width == pytest.approx(bare.pressing_force, rel=1e-14)
@@ -351,12 +348,8 @@ def test_a_bed_that_densifies_reaches_its_largest_solid_fraction_and_no_further(
 )
 def test_a_floated_scene_carries_its_force_and_is_valid_or_is_refused(preset, flow, higher, c, points, force):
     scene = Scene.preset(preset)
-    values = {
-        "flow": flow,
-        "elasticity.exponent": c,
-        "resolution.points": points,
-        "feed": {"kind": "single", "size": 1e-3},
-    }
+    values = {"flow": flow, "elasticity.exponent": c, "resolution.points": points}
+    values |= {"feed": {"kind": "single", "size": 1e-3}}
     values |= {"rolls.entry_gap": higher * scene.rolls.entry_gap, "rolls.specific_pressing_force": force}
     try:
         found = machine.float_gap(scene.with_values(values))
@@ -371,9 +364,8 @@ def test_a_force_that_jumps_past_what_is_wanted_is_refused():
     """Without a limit of shear (c <= 0) the bed has some as soon as a point compacts."""
     loose = {"elasticity.exponent": 0.0, "resolution.points": 60, "rolls.entry_gap": 2.0}
     scene = paper(loose | {"rolls.specific_pressing_force": 1e5, "flow.exponent": 1.0})
-    with pytest.raises(
-        ValueError, match=r"got .*; must lie outside .* between which the force jumps at a gap of .* mm"
-    ):
+    words = r"got .*; must lie outside .* between which the force jumps at a gap of .* mm"
+    with pytest.raises(ValueError, match=words):
         machine.float_gap(scene)
 
 

@@ -38,9 +38,8 @@ def test_never_worse_than_a_fine_grid(client, values, replicates, fine):
     """Two fields, two bounds of which one or both bind: the energy is at most that of a grid, but for its error."""
     scene = industrial(values)
     bounds = {"passing 6 mm": f">= {fine} %", "throughput": ">= 800 t/h"}
-    best = optimise(
-        scene, {"press_force": FORCE, "flow.nip_angle": NIP}, "specific energy", None, bounds, client=client
-    )
+    over = {"press_force": FORCE, "flow.nip_angle": NIP}
+    best = optimise(scene, over, "specific energy", None, bounds, client=client)
     axes = {"press_force": np.linspace(2e6, 5e6, 16), "flow.nip_angle": np.radians(np.linspace(7, 10, 13))}
     least = grid(scene, axes, {"passing 6 mm": fine / 100, "throughput": 800 / 3.6}, client, replicates)
     energy, error = best.figures["specific energy"]

@@ -482,13 +482,8 @@ def test_a_case_has_the_same_bits_alone_and_beside_others(name):
         }[name]
     )
     # an operating point of another feed, another one of another gap, and one that shares no call of the kernels
-    scenes = [
-        scene,
-        *(
-            scene.with_values(other)
-            for other in ({"feed.top_size": 0.05}, {"rolls.gap": 0.055}, {"fragments.exponent": 0.5})
-        ),
-    ]
+    others = {"feed.top_size": 0.05}, {"rolls.gap": 0.055}, {"fragments.exponent": 0.5}
+    scenes = [scene, *map(scene.with_values, others)]
     found = run_together([(one, [4, 0, 2]) for one in scenes], 3)
     every = [(one, replicate) for one in scenes for replicate in (4, 0, 2)]
     for (one, replicate), together in zip(every, itertools.chain(*found), strict=True):

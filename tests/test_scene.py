@@ -145,12 +145,7 @@ def test_unknown_sections_are_refused():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [
-        ("elasticity.integrator", "rk4"),
-        ("strength.stress", "max"),
-        ("resolution.record", "all"),
-        ("strength.stress", 3),
-    ],
+    [("elasticity.integrator", "rk4"), ("strength.stress", "max"), ("resolution.record", "x"), ("strength.stress", 3)],
 )
 def test_choices_are_listed(name, value):
     message = faults({name: value})[name][0]
@@ -293,11 +288,7 @@ def test_text_with_units_numbers_and_numpy_scalars_mean_the_same():
     ("name", "value", "words"),
     [
         ("rolls.gap", "19", "text without a unit; write it as '19 mm'"),
-        (
-            "rolls.gap",
-            "60 kg",
-            "got '60 kg'; not a quantity in mm: its unit 'kg' measures something else; give a value",
-        ),
+        ("rolls.gap", "60 kg", "got '60 kg'; not a quantity in mm: its unit 'kg' measures something else; give"),
         ("rolls.gap", "19 mm)", "not a number and a unit"),
         ("rolls.speed", "0.67 m/min", "not a rate of turning"),
         ("strength.cushioning", "1", "must be a number, not text"),

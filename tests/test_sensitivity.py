@@ -50,9 +50,8 @@ def test_throughput_is_a_product_of_independent_fields(client):
 def test_samples_stand_for_a_range(client):
     over = xr.Dataset({"rolls.width": ("sample", np.linspace(0.5, 1.5, 400)), "rolls.speed": ("sample", [1.0] * 400)})
     ranges = {"rolls.width": (0.5, 1.5), "rolls.speed": (1.0, 1.0 + 1e-9)}
-    drawn, given = (
-        sensitivity(paper(STRESS_ONLY), one, ["throughput"], count=16, client=client) for one in (over, ranges)
-    )
+    scene = paper(STRESS_ONLY)
+    drawn, given = (sensitivity(scene, one, ["throughput"], count=16, client=client) for one in (over, ranges))
     assert drawn["total_order"].values == pytest.approx(given["total_order"].values, abs=1e-4)
 
 

@@ -18,10 +18,8 @@ exponents = pytest.mark.parametrize("c", [0.3, 0.5, 1.0, 2.0])
 
 def loaded_path(scene, steps, volumetric_rate, time_step):
     """March one streamline through the strains of `steps`; positions do not matter to the stress."""
-    still = np.zeros((1, len(volumetric_rate)))
-    motion = Kinematics(
-        still, still, still[0], still, np.asarray(volumetric_rate, float)[None], *[still] * 3, time_step
-    )
+    still, rate = np.zeros((1, len(volumetric_rate))), np.asarray(volumetric_rate, float)[None]
+    motion = Kinematics(still, still, still[0], still, rate, *[still] * 3, time_step)
     _, *elastic = inputs_of(scene).laws()
     return stress.load(*elastic, motion, StepStrains(*(np.append(0.0, step)[None] for step in steps)))
 
@@ -219,9 +217,8 @@ def test_solid_fraction_is_capped_and_continuity_told():
 def test_negative_exponents_are_told_by_both_integrators(integrator, c):
     """At the onset shear outweighs compaction, and the law asks for tension; the explicit rule steps over it."""
     for exponent, told in ((c, True), (0.5, False)):
-        state = load_bed(
-            inputs_of(paper({"elasticity.exponent": exponent, "elasticity.integrator": integrator}))
-        ).stress
+        scene = paper({"elasticity.exponent": exponent, "elasticity.integrator": integrator})
+        state = load_bed(inputs_of(scene)).stress
         assert state.tension_clamped == told
         assert np.all(state.pressure >= 0)
 

@@ -196,9 +196,7 @@ def _inverse(known: list[tuple[float, float]]) -> float:
     values = {value for value, _ in known}
     if len(values) < len(known):
         return math.nan
-    return sum(
-        place * math.prod(other / (other - value) for other in values if other != value) for value, place in known
-    )
+    return sum(at * math.prod(other / (other - value) for other in values if other != value) for value, at in known)
 
 
 def _refused(wanted: float) -> str:

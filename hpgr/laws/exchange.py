@@ -15,7 +15,7 @@ from typing import Literal
 
 from hpgr.fields import Count, Frozen, Number, quantity
 
-_GRAVITY = 9.81  # m s-2
+_G = 9.81  # m s-2
 
 
 class Exchange(Frozen):
@@ -49,9 +49,7 @@ class Exchange(Frozen):
 
         It is 0 where percolation has no ceiling.
         """
-        return (
-            self.segregation * shear_rate / math.sqrt(_GRAVITY) if self.percolation == "gravity" else 0.0 * shear_rate
-        )
+        return self.segregation * shear_rate / math.sqrt(_G) if self.percolation == "gravity" else 0.0 * shear_rate
 
     def rising(self, sheared, upward, parcel):
         """Return the probability per time step and m of size difference that a cell rises over an edge, 1/m.

@@ -142,11 +142,9 @@ def _no_compaction(run: Run) -> str:
 
 
 def _solid_fraction_capped(run: Run) -> str:
-    needed, most = float(run.bed.stress.continuity_solid_fraction.max()), run.scene.bed.max_solid_fraction
-    words = (
-        f"mass continuity would need a solid fraction of {needed:.3g} at the exit; held at max_solid_fraction {most:g}"
-    )
-    return words if needed > most else ""
+    phi, most = float(run.bed.stress.continuity_solid_fraction.max()), run.scene.bed.max_solid_fraction
+    words = f"mass continuity would need a solid fraction of {phi:.3g} at the exit; held at max_solid_fraction {most:g}"
+    return words if phi > most else ""
 
 
 def _single_particle_nipping(run: Run) -> str:

@@ -268,15 +268,13 @@ def _flags(scene: Scene, result: Result):
     cells, found = scene.resolution.cells, result.flagged()
     needed = float(result["continuity_solid_fraction"].max()) / scene.bed.max_solid_fraction
     # as little as float32 cannot hold may be below the floor of a closed form
-    floored = bool(cells) and (
-        result["below_floor"].any() or (None if result.attrs["solver"] == "closed form" else False)
-    )
+    floor = cells > 0 and (result["below_floor"].any() or (None if result.attrs["solver"] == "closed form" else False))
     wanted = {
         "solid_fraction_capped": None if abs(needed - 1) <= _ROUNDING else needed > 1,
         "single_particle_nipping": scene.feed.largest_grain > _NIPPING * scene.rolls.gap,
         "no_compaction": not result["pressure"].any(),
         "no_breakage": bool(cells) and not result["breaks_per_cell"].any(),
-        "size_floor_reached": floored,
+        "size_floor_reached": floor,
         "few_cells": cells in (2, 3),
     }
     for name, must in wanted.items():

@@ -98,9 +98,7 @@ def _fields() -> dict[str, Any]:
 
 def _range(field: Any) -> Range | None:
     keys = ("gt", "ge", "lt", "le", "allow_inf_nan")
-    known = {
-        key: getattr(bound, key) for bound in field.metadata for key in keys if getattr(bound, key, None) is not None
-    }
+    known = {key: getattr(one, key) for one in field.metadata for key in keys if getattr(one, key, None) is not None}
     inner = {each for kind in (field.annotation, *get_args(field.annotation)) for each in (kind, *get_args(kind)[:1])}
     if get_origin(field.annotation) is tuple or not {"gt", "ge"} & known.keys():
         return None

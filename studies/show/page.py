@@ -202,9 +202,7 @@ def with_sieve(result: xr.Dataset, sieve: float, largest: float) -> xr.Dataset:
     if np.isclose(known, sieve, rtol=1e-9).any():
         sieve = known[np.argmin(np.abs(known - sieve))]
     wanted = np.union1d(known[first : last + 1], [sieve])
-    return xr.Dataset({name: metrics.between_sieves(kept[name], wanted) for name in kept}).assign(
-        status=result["status"]
-    )
+    return xr.Dataset({key: metrics.between_sieves(kept[key], wanted) for key in kept}).assign(status=result["status"])
 
 
 def axis_data(result: xr.Dataset, dim: str, scene: Scene) -> dict[str, Any]:
@@ -271,9 +269,7 @@ def feeds_of(result: xr.Dataset, scene: Scene) -> tuple[list[Feed | None], list[
     fed = {name: [_of_feed(place) for place in report.places(result, name)] for name in axes}
     swept = [name for name in axes if fed[name][0]]
     every = list(itertools.product(*(range(result.sizes[name]) for name in swept)))
-    values = [
-        dict(item for name, k in zip(swept, place, strict=True) for item in fed[name][k].items()) for place in every
-    ]
+    values = [dict(item for name, k in zip(swept, at, strict=True) for item in fed[name][k].items()) for at in every]
     places = itertools.product(*(range(result.sizes[name]) for name in axes))
     chosen = [tuple(k for name, k in zip(axes, place, strict=True) if name in swept) for place in places]
     return [_feed(scene, each) for each in values], [every.index(place) for place in chosen]

@@ -210,10 +210,8 @@ def remarks(result: xr.Dataset, every_flag: bool = False) -> list[str]:
     if result.attrs.get("left_out"):
         lines.append(f"left out, being of another shape from case to case: {result.attrs['left_out']}")
     if "exchange_substeps" in result:
-        swaps, most = float(result["swaps_per_cell"].mean()), int(result["exchange_substeps"].max())
-        lines.append(
-            f"exchange: {swaps:.3g} swaps of a cell in one residence time; at most {most} substeps a time step"
-        )
+        swaps, top = float(result["swaps_per_cell"].mean()), int(result["exchange_substeps"].max())
+        lines.append(f"exchange: {swaps:.3g} swaps of a cell in one residence time; at most {top} substeps a time step")
     return lines + (flagged(result) if every_flag else flag_line(result))
 
 

@@ -195,9 +195,7 @@ def open_cases(folder: str | Path) -> xr.Dataset:
         for address, code in zip(told["addresses"], told["status"], strict=True)
     ]
     files = [path for path in paths if path]
-    same_grid = SCENE not in space.axes and not any(
-        name.startswith(("resolution", "exchange")) for name in space.fields
-    )
+    same_grid = SCENE not in space.axes and not any(one.startswith(("resolution", "exchange")) for one in space.fields)
     shapes = _shapes(files[:1] if same_grid else files)
     left_out = sorted(name for name, sizes in shapes.items() if sizes is None)
     lazy = _lazily(np.array(paths, object).reshape(space.shape))

@@ -55,11 +55,9 @@ class Child:
 
     def __init__(self, spec: SweepSpec, at_once: int):
         self._spec, self._at_once = spec, at_once
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+        env = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
         command = [sys.executable, "-c", "from studies.sweep.isolated import serve; serve()"]
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, bufsize=-1
-        )
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=env, bufsize=-1)
         self._last = time.monotonic()
         self.dead = False
         told = spec._asdict() | {"base": spec.base.model_dump_json(), "at_once": at_once}

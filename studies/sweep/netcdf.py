@@ -20,10 +20,7 @@ _SEAL = b"hpgr-blake2b:"  # behind the last byte of a file of ours, where HDF5 l
 _DIGEST = 16  # bytes
 _CLASSIC = {b"CDF\x01", b"CDF\x02", b"CDF\x05"}  # how NetCDF-3 begins; any other start is left to HDF5
 _HARMLESS_FILTERS = range(1, 7)  # deflate, shuffle, fletcher32, szip, nbit, scaleoffset
-_MOST_ITEMS, _DEEPEST = (
-    10_000,
-    8,
-)  # variables and groups of a file, attributes of each; groups in groups: ours have none
+_MOST_ITEMS, _DEEPEST = 10_000, 8  # variables and groups, attributes of each; groups in groups: ours have none
 _MOST_TEXTS = 100  # in an attribute: one, stored once, may stand at any number of places
 _MOST_BYTES, _MOST_RATIO = 250_000_000, 100  # what a variable may unpack to: this much, or this many times the file
 
@@ -117,11 +114,9 @@ def _encoding(variable: xr.Variable) -> dict:
 def probe(path: str | Path) -> None:
     """Raise OSError if a file at `path` could not be written: better before hours of work than after."""
     path = Path(path)
-    existing = next(folder for folder in path.absolute().parents if folder.exists())
-    if not existing.is_dir() or not os.access(existing, os.W_OK):
-        raise OSError(
-            f"could not write the result: {existing} is no folder that can be written to; choose another --out"
-        )
+    home = next(folder for folder in path.absolute().parents if folder.exists())
+    if not home.is_dir() or not os.access(home, os.W_OK):
+        raise OSError(f"could not write the result: {home} is no folder that can be written to; choose another --out")
     if path.is_dir():
         raise OSError(f"could not write the result: {path} is a folder; give --out the name of a file")
 

@@ -341,9 +341,7 @@ def ends_of(ranges: Mapping[str, tuple[Any, Any]]) -> dict[str, tuple[float, flo
 def between(ends: Mapping[str, tuple[float, float]], unit: "np.ndarray") -> list[tuple]:
     """Return a row of values of the fields for each point of the unit cube, (point, field)."""
     whole = [isinstance(low, int) and isinstance(high, int) for low, high in ends.values()]
-    rows = (
-        [low + x * (high - low) for x, (low, high) in zip(row, ends.values(), strict=True)] for row in unit.tolist()
-    )
+    rows = ([low + x * (high - low) for x, (low, high) in zip(at, ends.values(), strict=True)] for at in unit.tolist())
     return [tuple(round(value) if k else value for value, k in zip(row, whole, strict=True)) for row in rows]
 
 

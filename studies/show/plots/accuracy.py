@@ -91,11 +91,9 @@ def _ladder(panel, result: xr.Dataset, name: str, title: str) -> None:
     last = 0.0
     for k in np.argsort(milliseconds):  # of those that would overlap only the first
         if milliseconds[k] > last:
-            last, place = 1.05 * milliseconds[k], (milliseconds[k], 0.985)
+            last, at = 1.05 * milliseconds[k], (milliseconds[k], 0.985)
             text = str(result[name].values[k])
-            panel.annotate(
-                text, place, xycoords=("data", "axes fraction"), rotation=90, fontsize=8, ha="center", va="top"
-            )
+            panel.annotate(text, at, xycoords=("data", "axes fraction"), rotation=90, fontsize=8, ha="center", va="top")
     panel.grid(color="0.9", which="both")
     _plain_numbers(panel)
 

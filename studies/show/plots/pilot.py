@@ -28,9 +28,7 @@ def pilot_figure(result: xr.Dataset) -> Figure:
         for k, (part, mark) in enumerate(_MARKERS.items())
         if part in seen
     ]
-    lines = [
-        Line2D([], [], color="0.3", linestyle=_LINES[k % len(_LINES)], label=name) for k, name in enumerate(sources)
-    ]
+    lines = [Line2D([], [], color="0.3", linestyle=_LINES[k % len(_LINES)], label=one) for k, one in enumerate(sources)]
     figure.legend(handles=parts + lines, loc="outside upper center", ncols=4, fontsize=9)
     figure.supxlabel(
         "Lines: predicted, with 90 % intervals; centre and edge are of the roll width. Other models: the total only.",
