@@ -184,17 +184,26 @@ def exchange():
 
 
 def gap():
-    """The floating gap; the force is another each time, as found gaps are remembered."""
+    """The floating gap, of another force or another machine each time, as what was found is remembered."""
     for preset in ("paper", "industrial", "khd_pilot"):
-        old, new = scenes(preset=preset)
-        forces = (1e5 if preset == "paper" else 3e6) * (1 + 1e-4 * np.arange(200))
-        mine, other = iter(forces), iter(forces)
-        times = turns(
-            lambda old=old, mine=mine: BEFORE.hpgr.operating_gap(old, next(mine)),
-            lambda new=new, other=other: hpgr.operating_gap(new, next(other)),
-            40,
-        )
-        show(f"operating_gap, {preset}", *times, 0.1)
+        force, others = 1e5 if preset == "paper" else 3e6, 1 + 1e-4 * np.arange(41)
+        diameter = scenes(preset=preset)[1].rolls.diameter
+        machines = [scenes({"rolls.diameter": diameter * other}, preset=preset) for other in others]
+        for what, cases in (
+            ("another force", [(*machines[0], force * other) for other in others]),
+            ("another machine", [(*machine, force) for machine in machines]),
+        ):
+            mine, theirs = iter(cases), iter(cases)
+
+            def before(mine=mine):
+                old, _, wanted = next(mine)
+                BEFORE.hpgr.operating_gap(old, wanted)
+
+            def now(theirs=theirs):
+                _, new, wanted = next(theirs)
+                hpgr.operating_gap(new, wanted)
+
+            show(f"operating_gap, {preset}, {what} each time", *turns(before, now, 40), 0.1)
 
 
 def simulate():
