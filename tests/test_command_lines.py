@@ -126,6 +126,15 @@ def test_no_default_of_a_preset_presses_the_bed_to_more_than_rock(run, name, pre
     assert name != "gap_sweep" or force.max() > 1.5 * force.min()
 
 
+def test_default_gaps_are_those_that_every_scene_can_be_at(run, refused):
+    assert run("--scene", "paper", "industrial", "--cells", "0", "--replicates", "1", "--no-plot")[0] == 0
+    result = opened("outputs/gap_sweep.nc")
+    assert 0.055 < float(result["gap"].min()) < 0.057
+    assert result["specific_pressing_force"].max() < 7.2e6  # of `industrial`, twice 3.5 N/mm2
+    message = refused("--scene", "khd_pilot", "industrial", "--out", "other.nc")
+    assert "at least 55.5 mm and the first has 23.7 mm; such as --gap" in message
+
+
 def test_further_axes_come_after_the_study_s_own(run):
     axes = ("--gap", "40 mm", "0.05 m", "--feed-top-size", "5 cm", "60 mm")
     code, out, _ = run(*axes, "--replicates", "1", "--no-plot", study=speed_sweep)

@@ -1,6 +1,7 @@
 """The command line that the sweeps over gap, speed and feed share."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
@@ -117,7 +118,7 @@ def _run(study: Study, options: Options) -> Report:
     scene = next(iter(scenes.values()))
     given, ranges = _given(options)
     study = _floating(study, [*given, *ranges], scene)
-    space = _space(study, options, scene, given, ranges)
+    space = _space(study, options, scenes, given, ranges)
     if AXES["feed_top_size"] in space and options.calibration is None:
         scenes = {label: one for name in scenes for label, one in _fitting_alike(name, scenes[name]).items()}
     space = ({SCENE: scenes} if len(scenes) > 1 else {}) | space
@@ -185,13 +186,15 @@ def _fitting_alike(name: str, scene: Scene) -> dict[str, Scene]:
     return {name: scene} | {f"{name}, {label}": one for label, one in presets.fitting_alike(scene).items()}
 
 
-def _space(study: Study, options: Options, scene: Scene, given: dict[str, list], ranges: dict[str, tuple]) -> dict:
+def _space(
+    study: Study, options: Options, scenes: dict[str, Scene], given: dict[str, list], ranges: dict[str, tuple]
+) -> dict:
     """Return the space of the options, the study's own field first; with default values if nothing else says what."""
-    main = AXES[study.main]
+    main, scene = AXES[study.main], next(iter(scenes.values()))
     if scene.feed.kind == "single" and "feed.top_size" in {main, *given, *ranges}:
         raise ValueError("--feed-top-size: the scene's feed is of a single size and has no top; sweep another feed")
     if main not in given and not ranges:
-        given = {main: _default_values(study, scene)} | given
+        given = {main: _default_values(study, list(scenes.values()))} | given
     space = {main: given[main]} | given if main in given else given
     if options.calibration is not None:
         if ranges:
@@ -201,29 +204,35 @@ def _space(study: Study, options: Options, scene: Scene, given: dict[str, list],
     return (sobol_design(ranges, options.sample, options.seed) if ranges else {}) | space
 
 
-def _default_values(study: Study, scene: Scene) -> list[float]:
-    """Return the scene's own value times the study's factors; of the gap as far as the bed can be pressed."""
-    section, key = AXES[study.main].split(".")
+def _default_values(study: Study, scenes: list[Scene]) -> list[float]:
+    """Return the first scene's own value times the study's factors; of the gap as far as the beds can be pressed."""
+    scene, (section, key) = scenes[0], AXES[study.main].split(".")
     own = getattr(getattr(scene, section), key)
     if own is None and key == "top_size":
         own = scene.feed.largest_grain
     shown = unit_shown(field_info(AXES[study.main]).unit)[1]
-    factors = _carried(study.factors, scene) if study.main == "gap" else study.factors
+    factors = _carried(study.factors, scenes) if study.main == "gap" else study.factors
     return [own if factor == 1 else float(f"{own * factor * shown:.3g}") / shown for factor in factors]
 
 
-def _carried(factors: tuple[float, ...], scene: Scene) -> tuple[float, ...]:
-    """Return factors of the gap, drawn together so that no gap carries more than twice the force of the scene's own.
+def _carried(factors: tuple[float, ...], scenes: list[Scene]) -> tuple[float, ...]:
+    """Return factors of the first gap, drawn together so that none carries more than twice the force of a scene's own.
 
     Where the nip takes in what it grips, the bed would else be denser than rock: of `industrial` at 0.83 of its gap.
     """
     from hpgr.bed import machine  # late: `--help` does without
 
-    try:
-        narrowest = machine.operating_gap(scene, _MOST_FORCE * machine.specific_pressing_force(scene))
-    except ValueError:  # no gap carries as much
-        return factors
-    reach = min(1.0, (1 - narrowest / scene.rolls.gap) / (1 - factors[0]))
+    own, narrowest = scenes[0].rolls.gap, factors[0] * scenes[0].rolls.gap
+    for scene in scenes:
+        with suppress(ValueError):  # no gap carries as much
+            force = _MOST_FORCE * machine.specific_pressing_force(scene)
+            narrowest = max(narrowest, machine.operating_gap(scene, force))
+    if narrowest >= own:
+        raise ValueError(
+            f"--gap: got none; has no default for scenes of which one needs at least {show(narrowest, 'm', 3)} and the "
+            f"first has {show(own, 'm')}; such as --gap '{show(1.2 * narrowest, 'm', 2)}'"
+        )
+    reach = (1 - narrowest / own) / (1 - factors[0])
     return tuple(1 + (factor - 1) * reach for factor in factors)
 
 
