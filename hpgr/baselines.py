@@ -197,12 +197,9 @@ def fit_torres_casali(tests: Sequence[PilotTest], scene: Scene) -> Fit:
     _refuse_none(tests)
     opening = "gap" if any(math.isnan(test.cake_thickness) for test in tests) else "cake_thickness"
     pressed = all(math.isfinite(test.hydraulic_pressure) for test in tests)
-    model = TorresCasaliModel(
-        _machine_of(tests, scene, opening),
-        max(coarsest_class(test.sizes) for test in tests),
-        opening,
-        "hydraulic_pressure" if pressed else "specific_pressing_force",
-    )
+    force = "hydraulic_pressure" if pressed else "specific_pressing_force"
+    coarsest = max(coarsest_class(test.sizes) for test in tests)
+    model = TorresCasaliModel(_machine_of(tests, scene, opening), coarsest, opening, force)
     return _least_squares(model, tests, TorresCasali)
 
 

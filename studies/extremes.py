@@ -143,11 +143,8 @@ def dataset(walked: Sequence[Walked], mapped: "xr.Dataset", seed: int = 0) -> "x
 
 def faulty(walked: Sequence[Walked]) -> list[str]:
     """Return every silent fault in words, with its scene as JSON values for `studies.guard.judge.base`."""
-    return [
-        f"FAULT in {each.part}, {each.name}: {each.outcome.message}\n  {json.dumps(each.values)}"
-        for each in walked
-        if each.outcome.kind == "fault"
-    ]
+    bad = [each for each in walked if each.outcome.kind == "fault"]
+    return [f"FAULT in {one.part}, {one.name}: {one.outcome.message}\n  {json.dumps(one.values)}" for one in bad]
 
 
 def table(result: "xr.Dataset") -> str:

@@ -137,14 +137,8 @@ def optimise(
     if not isinstance(subject_to, Mapping | None):
         raise ValueError(f"subject_to: got {subject_to!r:.80}; must be bounds; such as {{'passing 6 mm': '>= 60 %'}}")
     limits = [_limit(name, text) for name, texts in (subject_to or {}).items() for text in np.atleast_1d(texts)]
-    search = _Search(
-        scene,
-        ends_of(over),
-        quantity_of(minimise if maximise is None else maximise),
-        limits,
-        -1 if minimise is None else 1,
-        seed,
-    )
+    ends, sign = ends_of(over), -1 if minimise is None else 1
+    search = _Search(scene, ends, quantity_of(minimise if maximise is None else maximise), limits, sign, seed)
     tradeoff = search.design(options)
     without_effect = search.without_effect()
     best = search.descend()

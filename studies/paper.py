@@ -208,11 +208,8 @@ def _shown(shown: Scene) -> dict[str, Any]:
     bed = load_bed(inputs_of(shown, tessellated=True))
     motion, cells = bed.kinematics, bed.tessellation
     # the concave rim may cut a cell in two: outlines are of pieces
-    pieces = [
-        (number, np.asarray(piece.exterior.coords))
-        for number, cell in enumerate(cells.cells)
-        for piece in getattr(cell, "geoms", [cell])
-    ]
+    parts = enumerate(getattr(cell, "geoms", [cell]) for cell in cells.cells)
+    pieces = [(number, np.asarray(piece.exterior.coords)) for number, part in parts for piece in part]
     corners = np.concatenate([outline for _, outline in pieces])
     numbers = np.arange(len(pieces), dtype=np.int32)
     return {

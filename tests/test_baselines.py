@@ -220,14 +220,8 @@ def test_predictions_are_distributions_with_the_centre_finest(pilot):
             assert passing[-1] == pytest.approx(1.0)
         assert (found.centre - found.edge >= -1e-12).all()
         assert found.specific_energy == pytest.approx(found.power / found.throughput)
-        assert found.power == pytest.approx(
-            2
-            * test.specific_pressing_force
-            * 0.8
-            * 0.25
-            * test.surface_speed
-            * math.sin(baselines.nip_angle(KHD, test.cake_thickness) / 2)
-        )
+        force, angle = test.specific_pressing_force * 0.8 * 0.25, baselines.nip_angle(KHD, test.cake_thickness)
+        assert found.power == pytest.approx(2 * force * test.surface_speed * math.sin(angle / 2))
 
 
 # ---------------------------------------------------------------------------- Hinde & Kalala

@@ -13,13 +13,8 @@ from studies.pilot import START
 
 PSD, OPERATIONS = presets.DATA / "khd_porphyry_psd.csv", presets.DATA / "khd_porphyry_operations.csv"
 # n = inf is the closed form: quick, exact, and smooth in every parameter
-SMALL = START | {
-    "resolution.points": 21,
-    "resolution.streamlines": 1,
-    "resolution.record": "product",
-    "elasticity.bulk_modulus": 42e6,
-    "elasticity.shear_modulus": 19.5e6,
-}
+SMALL = START | {"resolution.points": 21, "resolution.streamlines": 1, "resolution.record": "product"}
+SMALL |= {"elasticity.bulk_modulus": 42e6, "elasticity.shear_modulus": 19.5e6}
 WIDE = {"roll_width": {"kind": "friction_hill", "edge_ratio": 0.1, "slices": 1}}
 PLANTED = {"sigma_m": 3.1e6, "w": 2.0, "k": 0.8, "gamma": 0.45, "nu": 0.5, "K": 50e6, "epsilon": 0.15, "T_0": 2e3}
 

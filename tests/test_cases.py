@@ -74,13 +74,8 @@ def test_address_is_the_same_in_another_process():
     script = "from support import paper; from studies.sweep.cases import Addresses, SweepSpec\n"
     script += "print(Addresses(SweepSpec(paper())).of({'rolls.gap': 0.05}, 1))"
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        env=os.environ | {"PYTHONPATH": path, "PYTHONHASHSEED": "7"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    env = os.environ | {"PYTHONPATH": path, "PYTHONHASHSEED": "7"}
+    done = subprocess.run([sys.executable, "-c", script], env=env, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == address(paper(), {"rolls.gap": 0.05}, 1)
 
 

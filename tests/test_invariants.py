@@ -22,12 +22,8 @@ from studies.guard import judge, ranges
 from studies.guard.invariants import INVARIANTS, violations
 
 INF = math.inf
-SMALL = {
-    "resolution.streamlines": 2,
-    "resolution.points": sized(31, 16),
-    "resolution.cells": sized(16, 6),
-    "rolls.entry_gap": 0.5,
-}
+SMALL = {"resolution.streamlines": 2, "resolution.points": sized(31, 16), "resolution.cells": sized(16, 6)}
+SMALL |= {"rolls.entry_gap": 0.5}
 KNOWN = ranges.numeric_fields()
 WALKED = {
     name: known
@@ -78,12 +74,8 @@ def test_any_rolls_end_well_flagged_or_refused(gap_place, rise_place, diameter, 
 
 # --- the checker sees each kind of fault ---------------------------------------------------------------------
 
-STILL = {
-    "exchange": {"interval": 1},
-    "resolution.snapshots": 3,
-    "strength.reference_strength": 1e15,
-    "strength.weibull_modulus": INF,
-}
+STILL = {"exchange": {"interval": 1}, "resolution.snapshots": 3}
+STILL |= {"strength.reference_strength": 1e15, "strength.weibull_modulus": INF}
 DISTRIBUTIONS = {"resolution.record": "distributions"}
 
 

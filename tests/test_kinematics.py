@@ -124,16 +124,14 @@ def assert_one_time_step_apart(scene, points):
     """Time between neighbours by quadrature of the fall's inverse over height."""
     bed, motion, _ = moved(scene, points)
     nip = nip_of(scene, bed)
+
+    def slowness(y, xi):
+        return -1 / velocity(scene, bed, xi * bed.outer(y), y)[1]
+
     for line, xi in enumerate(bed.xi):
         for upper, lower in zip(motion.y[line, :-1], motion.y[line, 1:], strict=True):
             kink = [nip] if lower < nip < upper else None
-            time = quad(
-                lambda y, xi=xi: -1 / velocity(scene, bed, xi * bed.outer(y), y)[1],
-                lower,
-                upper,
-                epsrel=1e-11,
-                points=kink,
-            )[0]
+            time = quad(slowness, lower, upper, xi, epsrel=1e-11, points=kink)[0]
             assert time == pytest.approx(motion.time_step, rel=1e-7)
 
 

@@ -229,12 +229,8 @@ def same(one, other):
 
 # --- floating gap -------------------------------------------------------------------------------------------
 
-FLOATING = {
-    "pilot": pilot(),
-    "industrial": industrial(),
-    "paper": paper({"resolution.cells": 0}),
-    "roll width": pilot({"roll_width": {}}),
-}
+FLOATING = {"pilot": pilot(), "industrial": industrial(), "paper": paper({"resolution.cells": 0})}
+FLOATING |= {"roll width": pilot({"roll_width": {}})}
 floating = pytest.mark.parametrize("scene", FLOATING.values(), ids=FLOATING)
 
 

@@ -346,13 +346,9 @@ def test_driver_killed_at_random_moments(tmp_path, record):
     """SIGKILL, again and again; HPGR_KILLS sets how often (default 12 for each kind of record)."""
     kills = os.environ.get("HPGR_KILLS", str(sized(12, 3)))
     script = _KILLED.format(tests=str(Path(__file__).parent), small=SMALL)
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", script, kills, record, str(tmp_path)],
-        capture_output=True,
-        text=True,
-        timeout=3000,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
-    )
+    command = [sys.executable, "-W", "ignore", "-c", script, kills, record, str(tmp_path)]
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, capture_output=True, text=True, timeout=3000, env=env)
     assert done.returncode == 0, done.stderr[-3000:]
     assert done.stdout.split()[0] == kills
     print(done.stdout)

@@ -222,11 +222,8 @@ def test_impossible_operations_are_refused(tmp_path, old, new, words):
 
 
 def test_faults_of_both_files_come_at_once_and_only_once(tmp_path):
-    faults = refused(
-        tmp_path,
-        PRODUCT.replace("A,1,10,40", "A,1,10,140") + "B,1,5,,,50\nB,2,90,,,100\n",
-        OPERATIONS.replace("A,0.5,2.5", "A,-0.5,x"),
-    )
+    product = PRODUCT.replace("A,1,10,40", "A,1,10,140") + "B,1,5,,,50\nB,2,90,,,100\n"
+    faults = refused(tmp_path, product, OPERATIONS.replace("A,0.5,2.5", "A,-0.5,x"))
     assert len(faults) == 5
     for fault, words in zip(faults, ("centre", "U_m_s", "Fsp_N_mm2", "test 'B'", "90"), strict=True):
         assert words in fault

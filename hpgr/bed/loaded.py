@@ -161,11 +161,8 @@ def _press(inputs: BedInputs, geometry: Geometry, motion: Kinematics, strains: S
         return Pressed(0.0, 0.0, 0.0)
     first = int((motion.volumetric_rate[-1] > 0).argmax())
     onset = inputs.laws()[0].nip_angle or math.asin(motion.y[-1, first] / geometry.radius)
-    return Pressed(
-        force_on_roll(inputs, geometry, motion, state),
-        _power(inputs, geometry, motion, strains, state),
-        onset if (strains.volumetric[-1] > 0).any() else 0.0,
-    )
+    force, power = force_on_roll(inputs, geometry, motion, state), _power(inputs, geometry, motion, strains, state)
+    return Pressed(force, power, onset if (strains.volumetric[-1] > 0).any() else 0.0)
 
 
 def _tessellated(inputs: BedInputs, bed: LoadedBed) -> "Tessellation":

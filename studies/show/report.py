@@ -47,13 +47,8 @@ def aligned(headings: Sequence[str], rows: Iterable[Sequence[str]], markdown: bo
         rows.insert(1, ["---" if k < max(words, 1) else "---:" for k in range(len(headings))])
         return "\n".join("| " + " | ".join(row) + " |" for row in rows)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = (
-        "  ".join(
-            text.ljust(width) if k < words else text.rjust(width)
-            for k, (text, width) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in rows
-    )
+    flush = [str.ljust if k < words else str.rjust for k in range(len(widths))]
+    lines = ("  ".join(put(*each) for put, *each in zip(flush, row, widths, strict=True)) for row in rows)
     return "\n".join(line.rstrip() for line in lines)
 
 

@@ -28,11 +28,8 @@ _SHADES = ("white", "0.86", "0.68", "0.35", "black")  # ok, flagged, substepped,
 _WORDS = ("·  ok", "flagged (letters)", "substepped (number of substeps, letters)", "×  refused", "!  silent fault")
 _ERROR_LEVELS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, np.inf)
 _ERROR_SHADES = [str(round(shade, 3)) for shade in np.linspace(1.0, 0.1, len(_ERROR_LEVELS) - 1)]
-_NAMES = {
-    "resolution.points": "time step dt",
-    "strength.cushioning": "cushioning n",
-    "elasticity.exponent": "exponent c",
-}
+_SAID = {"resolution.points": "time step dt", "strength.cushioning": "cushioning n"}
+_SAID |= {"elasticity.exponent": "exponent c"}
 
 
 def stability(result: xr.Dataset) -> Figure:
@@ -94,7 +91,7 @@ def _ticks(axis: xr.DataArray) -> list[str]:
 
 def _label(axis: xr.DataArray) -> str:
     field, shown = axis.attrs["scene_field"], unit_shown(axis.attrs["units"])[0]
-    return f"{_NAMES.get(field, field.replace('.', ' '))} [{'-' if shown == '1' else shown}]"
+    return f"{_SAID.get(field, field.replace('.', ' '))} [{'-' if shown == '1' else shown}]"
 
 
 def integrators(result: xr.Dataset) -> Figure:
