@@ -47,13 +47,9 @@ def measured(scene, test, noise=0.0, seed=0):
         return value * (1 + error) if relative else np.clip(value + error, 0, 1)
 
     apart = {name: off(getattr(found, name)) for name in ("centre", "edge", "total")}
-    return test._replace(
-        **apart,
-        throughput=float(off(found.throughput, True)),
-        power=float(off(found.power, True)),
-        cake_thickness=float(off(found.gap, True)),
-        specific_energy=math.nan,
-    )
+    throughput, power, gap = (float(off(value, True)) for value in (found.throughput, found.power, found.gap))
+    told = {"throughput": throughput, "power": power, "cake_thickness": gap, "specific_energy": math.nan}
+    return test._replace(**apart, **told)
 
 
 @pytest.mark.parametrize(

@@ -77,22 +77,14 @@ def parts(message):
         ("rolls.entry_gap", 0.9, "900 mm", "must be less than gap + 0.5 x diameter"),
         ("rolls.speed", 0, "0 rpm", "must be at least 9.5493e-06 rpm"),
         ("rolls.diameter", 2e3, "2e+06 mm", "must be at most 1e+06 mm"),
-        ("bed.solid_density", -2650, "-2650 kg m-3", "must be at least 1 kg m-3"),
-        ("bed.feed_solid_fraction", 1.1, "1.1", "must be at most 1"),
         ("bed.max_solid_fraction", 0.5, "0.5", "must be at least feed_solid_fraction 0.6"),
-        ("strength.reference_strength", 0, "0 MPa", "must be at least 1e-06 MPa"),
-        ("strength.weibull_modulus", -3, "-3", "must be at least 0.001"),
         ("strength.cushioning", 9e-7, "9e-07", "must be at least 1e-06"),
-        ("fragments.exponent", 0, "0", "must be at least 0.001"),
-        ("elasticity.shear_modulus", -1, "-1e-06 MPa", "must be at least 1e-06 MPa"),
         ("elasticity.exponent", -1, "-1", "must be greater than -1"),
         ("elasticity.substeps", 0, "0", "must be at least 1"),
         ("feed.bottom_size", 0.03, "30 mm", "must be less than top_size 20 mm"),
         ("feed.top_size", 0.07, "70 mm", "must be at most the entry gap rolls.entry_gap 60 mm"),
-        ("flow.entry_fraction", 5e-324, "4.94066e-324", "must be at least 1e-09"),
         ("flow.entry_fraction", 1, "1", "must be less than 1"),
         ("resolution.points", 1, "1", "must be at least 2"),
-        ("resolution.cells", -1, "-1", "must be at least 0"),
     ],
 )
 def test_refusals_name_field_value_bound_and_remedy(name, value, shown, bound):
@@ -274,11 +266,8 @@ def test_text_with_units_numbers_and_numpy_scalars_mean_the_same():
             getattr(scene, section).model_dump(exclude_none=True, exclude={"kind"}) for scene in (plain, text)
         )
         assert first == pytest.approx(second, rel=1e-14)
-    numpy = Scene(
-        rolls={name: np.float64(value) for name, value in ROLLS.items()},
-        feed=FEED,
-        resolution={"cells": np.int64(5), "points": np.uint8(7)},
-    )
+    rolls = {name: np.float64(value) for name, value in ROLLS.items()}
+    numpy = Scene(rolls=rolls, feed=FEED, resolution={"cells": np.int64(5), "points": np.uint8(7)})
     assert type(numpy.rolls.gap) is float
     assert (numpy.resolution.cells, type(numpy.resolution.points)) == (5, int)
     assert type(Rolls(**ROLLS | {"diameter": np.int32(1)}).diameter) is float
