@@ -44,6 +44,9 @@ _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
 _SHIFT_30, _SHIFT_27, _SHIFT_31 = np.uint64(30), np.uint64(27), np.uint64(31)
 _SHIFT_12 = np.uint64(12)
+_0F, _1F, _2F, _3F = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(3.0)
+_HALF, _THIRD, _FIFTH, _SIXTH = np.float32(1 / 2), np.float32(1 / 3), np.float32(1 / 5), np.float32(1 / 6)
+_ROOM, _LOST, _SURELY_1, _MORE = np.float32(5e-7), np.float32(1e-37), np.float32(1.0 - 1e-6), np.float32(1.0 + 3e-6)
 _1 = np.uint64(1)  # places are unsigned, or every one of them would be tested for being negative
 
 
@@ -303,16 +306,6 @@ def start_parcels(bases, ore, slots, uniforms, streams, weakness):
             uniforms[k, p] = (uniforms[k, p] + uniform(state)) / cells
 
 
-@_compiled
-def put(parcels, slots, sizes):
-    """Put unbroken cells of these sizes (parcel, cell), m, in the slots."""
-    for k in range(slots.size):
-        slot = slots[k]
-        for p in range(sizes.shape[1]):
-            parcels.sizes[slot, p + 1] = max(sizes[k, p], SMALLEST)
-        parcels.bounds_outdated[slot], parcels.breaks[slot] = True, 0
-
-
 # --- sieves -------------------------------------------------------------------------------------------------
 
 
@@ -472,10 +465,7 @@ def _decide(count, before, own, after, weakness, weak, ore, critical_ratio, verd
     In float32, whose vectors are twice as long and divide four times as fast. Every bound has room for its rounding:
     3e-7 in z, less than 1e-6 in the cubics, 2e-6 in what they are compared with. Logarithms decide what that leaves.
     """
-    zero, half, one, two, three = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0), np.float32(3.0)
-    third, fifth, sixth = np.float32(1 / 3), np.float32(1 / 5), np.float32(1 / 6)
-    room, lost, surely_one = np.float32(5e-7), np.float32(1e-37), np.float32(1.0 - 1e-6)
-    per_size, flat = np.float32(ore.inverse_size), np.float32(0.0 if ore.inverse_size > 0.0 else 1.0)
+    per_size, flat = np.float32(ore.inverse_size), _0F if ore.inverse_size > 0.0 else _1F
     stiffness = ore.cushion / ore.scale
     # what may leave the range of float32 decides nothing: then only the logarithms do
     trusted = 1e-25 < critical_ratio < 1e25 and stiffness < 1e12
@@ -492,21 +482,21 @@ def _decide(count, before, own, after, weakness, weak, ore, critical_ratio, verd
         # |log(s / sbar)| = 2 artanh(z) between low and, up to zz = 1/2, high; exp(-y) between the two cubics.
         # Two divisions: one for sbar and one for the series' rest, zz^2 / (5 - 5 zz), would cost 15 ns a cell
         total = (before[k] + after[k]) + size
-        z = abs(three * size - total) / (three * size + total)
-        least_z, most_z = z - room if z > room else zero, z + room
+        z = abs(_3F * size - total) / (_3F * size + total)
+        least_z, most_z = z - _ROOM if z > _ROOM else _0F, z + _ROOM
         zz = least_z * least_z
-        low = two * least_z * (one + zz * third)
+        low = _2F * least_z * (_1F + zz * _THIRD)
         zz = most_z * most_z
-        high = two * most_z * (one + zz * (third + zz * (fifth + zz * (two * fifth))))
+        high = _2F * most_z * (_1F + zz * (_THIRD + zz * (_FIFTH + zz * (_2F * _FIFTH))))
         y = least_stiff * (low * low)
-        most = ratio / (one + y * (one + y * (half + y * sixth)))
+        most = ratio / (_1F + y * (_1F + y * (_HALF + y * _SIXTH)))
         y = most_stiff * (high * high)
-        least = ratio * (surely_one - y * (one - y * (half - y * sixth)))
-        sure = (least if zz <= half else zero) >= surely
+        least = ratio * (_SURELY_1 - y * (_1F - y * (_HALF - y * _SIXTH)))
+        sure = (least if zz <= _HALF else _0F) >= surely
         doubt = sure != (most >= hardly)
         verdicts[k] = np.uint8(sure) + np.uint8(2) * np.uint8(doubt)
         doubts = np.int32(doubts + np.int32(doubt))
-        before[k] = most * np.float32(1.0 + 3e-6) + lost
+        before[k] = most * _MORE + _LOST
     return doubts > 0
 
 
@@ -588,7 +578,7 @@ def _break(sizes, weakness, slot, bounds, places, found, known, ratios):
     """Replace each cell that breaks by its fragment; set anew its bound and its neighbours', around the ends too."""
     cells = sizes.size - 2
     for k in range(found):
-        p, ratio = places[k], ratios[k]
+        p, ratio = np.uint64(places[k]), ratios[k]  # one kind of place to compile `_unshielded` for
         sizes[p] = np.float32(sizes[p] * ratio if sizes[p] * ratio > SMALLEST else SMALLEST)
         bounds[p - _1] = _unshielded(sizes, weakness, slot, p - _1, known)
         bounds[p] = _unshielded(sizes, weakness, slot, p, known)

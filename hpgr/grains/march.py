@@ -80,7 +80,8 @@ def fill(parcels: Parcels, slots: np.ndarray, scene: Scene, bases: np.ndarray, q
     """
     uniforms = np.empty((slots.size, scene.resolution.cells))
     kernels.start_parcels(bases, ore(scene), slots, uniforms, parcels.streams, parcels.weakness)
-    kernels.put(parcels, slots, (quantile or scene.feed.quantile)(uniforms))
+    parcels.sizes[slots, 1:-1] = np.maximum((quantile or scene.feed.quantile)(uniforms), kernels.SMALLEST)
+    parcels.bounds_outdated[slots], parcels.breaks[slots] = True, 0
 
 
 def first_cells(scene: Scene, seed: int, keys: list[tuple[int, ...]], quantile: Callable | None = None) -> Parcels:
