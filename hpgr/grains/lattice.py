@@ -310,7 +310,8 @@ def settle(scene: Scene, rates: SwapRates, shape: tuple[int, int], first: int) -
         means = flat @ sizes
         return *edges_of(scene, rates, means), means
 
-    for _ in range(shape[1]):  # what is at the last point by then has seen the steady field of all others
+    reach = int(np.abs(np.diff(rates.pairs % shape[1])).max(initial=0))  # points along a streamline between neighbours
+    for _ in range(shape[1] + reach):  # what is at the last point by then has seen the steady field of all others
         edges, substeps, means = shift()
         kernels.swap_mean_field(flat, sizes, edges, means, swaps, *work)
         most = max(most, substeps)
