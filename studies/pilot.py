@@ -173,7 +173,7 @@ def _models(
     from hpgr import calibration
     from hpgr.baselines import MODELS
 
-    print(f"fitting to {', '.join(test.name for test in known)} (about a minute)", flush=True)
+    print(f"fitting to {', '.join(test.name for test in known)} (under a minute)", flush=True)
     found = calibration.fit_tests(scene, known, fit)
     found = calibration.validated(found) if len(known) > 2 else found
     fitted = [calibration.PARAMETERS[name] for name in found.problem.names]
@@ -474,8 +474,9 @@ def blind_summary(result: "xr.Dataset") -> list[str]:
         one = blind.sel(source=name)
         total = one["rmse"].sel(part="total")
         worst = {key: float(abs(100 * (one[key] / measured[key] - 1)).max()) for key in ("throughput", "power")}
-        errors = ", ".join(f"{key} within {_figure(value, '.1f')} %" for key, value in worst.items())
-        lines.append(f"  {name}: median {float(total.median()):.2f}, largest {float(total.max()):.2f}; {errors}")
+        errors = [f"{key} within {value:.1f} %" for key, value in worst.items() if not math.isnan(value)]
+        told = f"  {name}: median {float(total.median()):.2f}, largest {float(total.max()):.2f}"
+        lines.append("; ".join(filter(None, (told, ", ".join(errors)))))
     return lines
 
 
