@@ -27,45 +27,21 @@ _CLASSES = 24  # of equal mass that the mean field is made of
 
 
 class SwapRates(NamedTuple):
-    """Probabilities of a swap per time step and edge, before the sizes are known.
+    """Probabilities of a swap per time step and edge, before the sizes are known."""
 
-    Attributes
-    ----------
-    pairs : ndarray
-        (edge, 2) numbers of the points below and above, streamline by streamline.
-    rise : ndarray
-        (edge,) probability of segregation per m of size difference, 1/m.
-    mixing : ndarray
-        (edge,) probability of mixing per squared mean size, 1/m2.
-    ceiling : ndarray
-        (edge,) what holds segregation, see `hpgr.laws.exchange.Exchange.ceiling`; 0 where nothing does.
-    """
-
-    pairs: np.ndarray
-    rise: np.ndarray
-    mixing: np.ndarray
-    ceiling: np.ndarray
+    pairs: np.ndarray  # (edge, 2) numbers of the points below and above, streamline by streamline
+    rise: np.ndarray  # (edge,) probability of segregation per m of size difference, 1/m
+    mixing: np.ndarray  # (edge,) probability of mixing per squared mean size, 1/m2
+    ceiling: np.ndarray  # (edge,) what holds segregation, see `hpgr.laws.exchange.Exchange.ceiling`; 0: nothing
 
 
 class Exchanged(NamedTuple):
-    """What only the lattice knows.
+    """What only the lattice knows."""
 
-    Attributes
-    ----------
-    elapsed_time : ndarray
-        (time,) time of each snapshot since the first fill, s.
-    steady : ndarray of bool
-        (time,) whether it was taken after one residence time; the product is that of these snapshots.
-    substeps : int
-        Most substeps a time step was split into to keep the swap probabilities of a cell at 1/2.
-    swaps_per_cell : float
-        Mean number of swaps a cell takes part in during one residence time.
-    """
-
-    elapsed_time: np.ndarray
-    steady: np.ndarray
-    substeps: int
-    swaps_per_cell: float
+    elapsed_time: np.ndarray  # (time,) time of each snapshot since the first fill, s
+    steady: np.ndarray  # (time,) of bool, whether it was taken after one residence time: the product is that of these
+    substeps: int  # most that a time step was split into to keep the swap probabilities of a cell at 1/2
+    swaps_per_cell: float  # mean number of swaps a cell takes part in during one residence time
 
 
 def swap_rates(scene: Scene, bed: LoadedBed) -> SwapRates:
@@ -94,18 +70,8 @@ def substeps_needed(rates: SwapRates, mixing: np.ndarray, means: np.ndarray, lar
     """Return in how many substeps of a time step each edge takes part, with its probability split between them.
 
     As many as the needier of its two parcels must have: then the probabilities of any cell sum to at most 1/2
-    in each substep.
-
-    Parameters
-    ----------
-    rates : SwapRates
-        Swap rates per time step.
-    mixing : ndarray
-        (edge,) probability of a swap by mixing per time step.
-    means : ndarray
-        Mean size of the parcel at each point, m.
-    largest : float
-        Size of the largest grain anywhere, m.
+    in each substep. Given the probability of a swap by mixing per time step (edge,), the mean size of the parcel at
+    each point, m, and that of the largest grain anywhere, m.
     """
     substeps = np.empty(mixing.size, np.int64)
     kernels.split(rates.pairs, rates.rise, mixing, means, largest, LARGEST_SUM, np.zeros(means.size), substeps)
@@ -282,21 +248,11 @@ class Lattice:
 
 
 class Above(NamedTuple):
-    """What the steady mean field of unbroken feed gives to a lattice that begins at a point of it.
+    """What the steady mean field of unbroken feed gives to a lattice that begins at a point of it."""
 
-    Attributes
-    ----------
-    entering : ndarray
-        (streamline, class) part of each class of the feed, classes of equal mass, in what enters the lattice.
-    swaps : float
-        Expected swaps of a cell index in a time step above the lattice.
-    substeps : int
-        Most substeps a time step has needed.
-    """
-
-    entering: np.ndarray
-    swaps: float
-    substeps: int
+    entering: np.ndarray  # (streamline, class) part of each class of the feed, of equal mass, in what enters
+    swaps: float  # expected of a cell index in a time step above the lattice
+    substeps: int  # most that a time step has needed
 
 
 def settle(scene: Scene, rates: SwapRates, shape: tuple[int, int], first: int) -> Above:

@@ -22,28 +22,13 @@ AT_ONCE = 50_000  # cells of the parcels of a call, whose work space then stays 
 
 
 class Cells(NamedTuple):
-    """What solvers that draw cells leave.
+    """What solvers that draw cells leave; a line is a streamline of a slice of the roll width."""
 
-    Attributes
-    ----------
-    product : ndarray
-        (replicate, snapshot, line, cell) float32, sizes at the exit, m; a line is a streamline of a slice of the roll
-        width.
-    breaks : ndarray
-        (replicate, line) breaks of all cells of the product.
-    size : ndarray or None
-        (replicate, time, line, point, cell) float32, m.
-    classes : ndarray or None
-        (replicate, time, line, point, sieve + 1) cells of each sieve class.
-    complete : ndarray or None
-        As `product`, sizes that the same cells come to without cushioning.
-    """
-
-    product: np.ndarray
-    breaks: np.ndarray
-    size: np.ndarray | None
-    classes: np.ndarray | None
-    complete: np.ndarray | None = None
+    product: np.ndarray  # (replicate, snapshot, line, cell) float32, sizes at the exit, m
+    breaks: np.ndarray  # (replicate, line) breaks of all cells of the product
+    size: np.ndarray | None  # (replicate, time, line, point, cell) float32, m
+    classes: np.ndarray | None  # (replicate, time, line, point, sieve + 1) cells of each sieve class
+    complete: np.ndarray | None = None  # as `product`, sizes that the same cells come to without cushioning
 
 
 def ore(scene: Scene) -> Ore:
@@ -130,23 +115,11 @@ def march(
 ) -> Cells:
     """March one parcel per slice, streamline and snapshot of each run.
 
-    Each parcel is keyed, so their order does not matter. Runs share calls of the kernels: the Python between the
-    calls costs as much as crushing a thousand cells.
-
-    Parameters
-    ----------
-    scenes : sequence of Scene
-        What is simulated; scenes may differ in their feed and what loads it.
-    log_stress : ndarray
-        (scene, streamline, point) log(sigma_a / sigma_m) in the middle of the roll width.
-    slices : Slices
-        The slices along the roll width.
-    seed : int
-        Key of the randomness, with the replicates.
-    runs : sequence of (int, int)
-        Number of the scene, those of one together, and of the independent repetition.
-    complete : bool
-        Whether to tell what the cells come to without cushioning, too.
+    Each parcel is keyed, by `seed` and replicate, so their order does not matter. Runs share calls of the kernels: the
+    Python between the calls costs as much as crushing a thousand cells. Scenes may differ in their feed and what loads
+    it: `log_stress`, (scene, streamline, point) log(sigma_a / sigma_m), is that in the middle of the roll width. Runs
+    are numbers of a scene, those of one together, and of an independent repetition. `complete` asks for what the cells
+    come to without cushioning, too.
     """
     scene, grid = scenes[0], scenes[0].resolution
     _, tubes, points = log_stress.shape

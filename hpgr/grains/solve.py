@@ -23,58 +23,28 @@ FRACTIONS = (0.5, 0.8)  # of the percentiles every product is summarised by
 
 
 class AlongWidth(NamedTuple):
-    """Product along the roll width.
+    """Product along the roll width."""
 
-    Attributes
-    ----------
-    passing : ndarray
-        (slice, sieve) mass fraction of the product of each slice passing each sieve.
-    centre_passing, edge_passing : ndarray
-        (sieve,) of the product called centre and edge.
-    centre_percentiles, edge_percentiles : ndarray
-        (2,) P50 and P80 of these, m.
-    """
-
-    passing: np.ndarray
-    centre_passing: np.ndarray
-    edge_passing: np.ndarray
-    centre_percentiles: np.ndarray
+    passing: np.ndarray  # (slice, sieve) mass fraction of the product of each slice passing each sieve
+    centre_passing: np.ndarray  # (sieve,) of the product called centre
+    edge_passing: np.ndarray  # and of that called edge
+    centre_percentiles: np.ndarray  # (2,) P50 and P80 of these, m
     edge_percentiles: np.ndarray
 
 
 class Crushed(NamedTuple):
-    """What crushing left behind; what was not asked for is None.
+    """What crushing left behind; what was not asked for is None."""
 
-    Attributes
-    ----------
-    breaks : ndarray
-        (streamline,) mean number of breaks per cell.
-    below_floor : ndarray
-        (streamline,) fraction of the product below the size floor, where nothing breaks.
-    passing, total_passing : ndarray
-        (streamline, sieve) and (sieve,), mass fraction of the product passing each sieve.
-    percentiles, total_percentiles : ndarray
-        (2, streamline) and (2,), P50 and P80 of the product, m.
-    size : ndarray
-        (time, streamline, point, cell) float32, m.
-    mass_fraction : ndarray
-        (time, streamline, point, sieve) mass fraction between each sieve and the next finer one.
-    exchanged : Exchanged
-        What only a scene with exchange has.
-    along_width : AlongWidth
-        What only a scene with a roll width has; all else is then combined over the width.
-    """
-
-    breaks: np.ndarray
-    below_floor: np.ndarray
-    passing: np.ndarray
-    total_passing: np.ndarray
-    percentiles: np.ndarray
-    total_percentiles: np.ndarray
-    size: np.ndarray | None = None
-    mass_fraction: np.ndarray | None = None
-    exchanged: Exchanged | None = None
-    along_width: AlongWidth | None = None
+    breaks: np.ndarray  # (streamline,) mean number of breaks per cell
+    below_floor: np.ndarray  # (streamline,) fraction of the product below the size floor, where nothing breaks
+    passing: np.ndarray  # (streamline, sieve) mass fraction of the product passing each sieve
+    total_passing: np.ndarray  # (sieve,)
+    percentiles: np.ndarray  # (2, streamline) P50 and P80 of the product, m
+    total_percentiles: np.ndarray  # (2,)
+    size: np.ndarray | None = None  # (time, streamline, point, cell) float32, m
+    mass_fraction: np.ndarray | None = None  # (time, streamline, point, sieve) between a sieve and the next finer one
+    exchanged: Exchanged | None = None  # what only a scene with exchange has
+    along_width: AlongWidth | None = None  # of a scene with a roll width; all else is then combined over the width
 
 
 def choose(scene: Scene) -> str:
@@ -312,18 +282,10 @@ def _fractions(shape: tuple[int, ...]) -> np.ndarray:
 
 
 class Mixed(NamedTuple):
-    """Cells of all slices together, each slice with its share of the mass.
+    """Cells of all slices together, each slice with its share of the mass."""
 
-    Attributes
-    ----------
-    sizes : ndarray
-        (replicate, line, cell) sorted, m.
-    reached : ndarray or None
-        Mass fraction up to each cell; None of one slice.
-    """
-
-    sizes: np.ndarray
-    reached: np.ndarray | None = None
+    sizes: np.ndarray  # (replicate, line, cell) sorted, m
+    reached: np.ndarray | None = None  # mass fraction up to each cell; None of one slice
 
 
 def _mixed(cells: np.ndarray, shares: list[np.ndarray]) -> list[Mixed]:
@@ -369,17 +331,10 @@ class Control(NamedTuple):
     A grain ends no coarser without cushioning than with it: F = P(X <= x | Y <= x) P(Y <= x). The second factor is
     known exactly and the first, which scatters less, is counted: F is the cells' own, times the exact passing of Y
     over theirs. That is the regression on Y <= x, whose slope is P(X <= x) / P(Y <= x) here.
-
-    Attributes
-    ----------
-    complete : ndarray
-        (slice, replicate, streamline, cell) sorted sizes Y, m.
-    exact : callable
-        Passing of Y, (..., slice, replicate or 1, streamline), as a function of size, m.
     """
 
-    complete: np.ndarray
-    exact: Callable
+    complete: np.ndarray  # (slice, replicate, streamline, cell) sorted sizes Y, m
+    exact: Callable  # passing of Y, (..., slice, replicate or 1, streamline), as a function of size, m
 
     def passing(self, counts: np.ndarray, sieves: np.ndarray) -> np.ndarray:
         """Return the passing (slice, replicate, streamline, sieve), given how many cells of the product pass."""
