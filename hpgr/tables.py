@@ -152,7 +152,10 @@ def text_of(path: str | Path) -> str:
 
     OSError if it cannot be opened; ValueError if it is anything else.
     """
-    status = os.stat(path)  # before it is opened: a pipe would make us wait, a device never end
+    try:
+        status = os.stat(path)  # before it is opened: a pipe would make us wait, a device never end
+    except OSError as error:
+        raise type(error)(error.errno, f"{error.strerror}; give a file that can be read", str(path)) from None
     if not stat.S_ISREG(status.st_mode):
         raise ValueError(f"{path}: is no regular file; it must be one; save it as text")
     with open(path, "rb") as file:

@@ -396,6 +396,7 @@ NO_ARGUMENTS = {
     "path: got 3; must be a path; such as path='outputs/mine'": lambda s, d: hpgr.Scene.from_file(3),
     "path: got 'a\\x00'; must be a path": lambda s, d: hpgr.Scene.from_file("a\0"),
     f"{Path(__file__).parent}: is no regular file": lambda s, d: hpgr.Scene.from_file(Path(__file__).parent),
+    "[Errno 2] No such file or directory; give a file that can be read: 'gone'": lambda s, d: Scene.from_file("gone"),
     "base: got array(": lambda s, d: hpgr.Scene.preset(np.zeros(2)),
     "scene: got 'alike'; must be a scene": lambda s, d: hpgr.presets.fitting_alike("alike"),
     "product: got None; must be a path": lambda s, d: hpgr.calibrate(s, None, None, OPERATIONS),
@@ -443,7 +444,7 @@ def small():
 
 @pytest.mark.parametrize("words", NO_ARGUMENTS)
 def test_what_is_no_argument_is_refused_by_its_name(small, words):
-    with pytest.raises((TypeError, ValueError), match=f"^{re.escape(words)}"):
+    with pytest.raises((TypeError, ValueError, OSError), match=f"^{re.escape(words)}"):
         NO_ARGUMENTS[words](*small)
 
 
