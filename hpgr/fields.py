@@ -109,41 +109,27 @@ def parse(text: str, unit: str) -> float:
     return float(f"{magnitude:.15g}")  # "13 mm" is the float 0.013, not its neighbour that 13 times 1e-3 gives
 
 
-_RANGES = {  # of numbers that functions take beside a scene: least, most, unit and an example
-    "tolerance": ("1e-4", "0.5", "", "0.01"),
-    "max_cost": ("0", "inf", " s", "60"),
-    "timeout": ("0.1", "1e6", " s", "60"),
-    "percent": ("0", "100", "", "80"),
+_SEED = (0, 2**63 - 1, "a whole number from 0 to 2**63 - 1", 0)  # which a result file can hold
+_COUNT = (1, 10**6, "a whole number from 1 to 1,000,000", 2)
+_RANGES = {  # of numbers that functions take beside a scene: least, most, both in words, and an example
+    "tolerance": (1e-4, 0.5, "within 1e-4 to 0.5", 0.01),
+    "max_cost": (0, math.inf, "within 0 to inf s", 60),
+    "timeout": (0.1, 1e6, "within 0.1 to 1e6 s", 60),
+    "percent": (0, 100, "within 0 to 100", 80),
+    "seed": _SEED,
+    "replicate": _SEED,
+    "replicates": _COUNT,
+    "threads": _COUNT,
+    "workers": _COUNT,
 }
 
 
 def check_number(name: str, value: Any) -> None:
-    """Raise ValueError if an argument of a public function is not a number in its range."""
-    least, most, unit, example = _RANGES[name.strip("-").replace("-", "_")]
-    number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if not number or not float(least) <= value <= float(most):
-        raise ValueError(f"{name}: got {value!r:.80}; must be within {least} to {most}{unit}; such as {name}={example}")
-
-
-def check_count(name: str, value: Any) -> None:
-    """Raise ValueError if an argument of a public function is not a whole number from 1 to a million."""
-    _check_whole(name, value, 1, "1,000,000", 10**6)
-
-
-def check_seed(name: str, value: Any) -> None:
-    """Raise ValueError if a seed or replicate number is not a whole number that a result file can hold."""
-    _check_whole(name, value, 0, "2**63 - 1", 2**63 - 1)
-
-
-def _check_whole(name: str, value: Any, least: int, shown: str, most: int) -> None:
-    try:
-        whole = -1 if isinstance(value, bool) else operator.index(value)
-    except TypeError:
-        whole = -1
-    if not least <= whole <= most:
-        raise ValueError(
-            f"{name}: got {value!r:.80}; must be a whole number from {least} to {shown}; such as {name}={least}"
-        )
+    """Raise ValueError if an argument of a public function, or an option, is not a number in its range."""
+    least, most, words, example = _RANGES[name.strip("-").replace("-", "_")]
+    kind = numbers.Integral if "whole" in words else numbers.Real
+    if isinstance(value, bool) or not isinstance(value, kind) or not least <= value <= most:
+        raise ValueError(f"{name}: got {value!r:.80}; must be {words}; such as {name}={example}")
 
 
 def path_of(name: str, value: Any) -> Path:

@@ -11,7 +11,7 @@ import numpy as np
 from hpgr import __version__, cost
 from hpgr.bed import machine
 from hpgr.bed.loaded import Beds, LoadedBed, inputs_of
-from hpgr.fields import check_number, check_seed
+from hpgr.fields import check_number
 from hpgr.grains import solve
 from hpgr.results import flags, schema
 from hpgr.scene import Scene, check_scene
@@ -139,9 +139,8 @@ def simulate(
     {'time': 1, 'streamline': 10, 'point': 50, 'cell': 200}
     """
     check_scene(scene)
-    check_seed("seed", seed)
-    check_seed("replicate", replicate)
-    check_number("max_cost", max_cost)
+    for name, value in {"seed": seed, "replicate": replicate, "max_cost": max_cost}.items():
+        check_number(name, value)
     chosen = {}
     if tolerance is not None:
         estimate = refine(scene, tolerance, run_scene, max_cost, seed)

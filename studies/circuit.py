@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import ValidationError
 
-from hpgr.fields import Frozen, Metres, Number, check_count, check_seed, faults_of, quantity, show
+from hpgr.fields import Frozen, Metres, Number, check_number, faults_of, quantity, show
 from hpgr.laws.feed import TableFeed
 from hpgr.scene import Scene, check_scene
 from studies import command as line
@@ -200,8 +200,8 @@ def close_circuit(
     from studies.sweep.assemble import assemble
 
     check_scene(scene)
-    check_count("replicates", replicates)
-    check_seed("seed", seed)
+    check_number("replicates", replicates)
+    check_number("seed", seed)
     if not isinstance(returned, Screen | EdgeRecycle):
         raise ValueError(f"returned: got {returned!r:.80}; must be what separates; such as Screen(cut_size='6 mm')")
     spec = SweepSpec(scene.with_values({"resolution.record": "product"}), seed)
@@ -310,7 +310,7 @@ def main(options: Options) -> Report:
         raise ValueError("--cut: give a screen's cut size, or --edge-recycle; such as --cut '6 mm'")
     screen = {"cut_size": options.cut, "sharpness": options.sharpness, "bypass": options.bypass}
     returned = EdgeRecycle() if options.edge_recycle else Screen(**screen)
-    space = line.values_of(options.vary)
+    space = line.all_varied(list, options.vary)
     result = close_circuit(line.base_scene(options), returned, space, options.replicates, options.seed)
     from studies.show import report
     from studies.show.plots.circuit import circuit_figure

@@ -16,7 +16,7 @@ import tyro
 from pydantic import ValidationError
 
 from hpgr import presets
-from hpgr.fields import check_seed, faults_of, parse
+from hpgr.fields import check_number, faults_of, parse
 from hpgr.scene import Scene, field_info, levels
 from studies.sweep.space import ends_of, field_of
 
@@ -184,19 +184,9 @@ def varied(text: str) -> tuple[str, list | tuple]:
     return field, [round(value) for value in values] if isinstance(low, int) and isinstance(high, int) else values
 
 
-def values_of(texts: Sequence[str]) -> dict[str, list]:
-    """Return the values of each field that `--vary` is given for; a range in place of values is refused."""
-    return _all_of(list, texts, "values; such as 'gap=40 mm..60 mm:5'")
-
-
-def ranges(texts: Sequence[str]) -> dict[str, tuple]:
-    """Return the range of each field that `--vary` is given for; values in place of a range are refused."""
-    if not texts:
-        raise ValueError("--vary: got nothing; must be ranges; such as 'gap=40 mm..60 mm'")
-    return _all_of(tuple, texts, "ranges; such as 'gap=40 mm..60 mm'")
-
-
-def _all_of(kind: type, texts: Sequence[str], words: str) -> dict[str, Any]:
+def all_varied(kind: type, texts: Sequence[str]) -> dict[str, Any]:
+    """Return what `--vary` gives of each field: a list of values, or a tuple, which is a range; not the other kind."""
+    words = "values; such as 'gap=40 mm..60 mm:5'" if kind is list else "ranges; such as 'gap=40 mm..60 mm'"
     found: dict[str, Any] = {}
     for text in texts:
         field, values = varied(text)
@@ -315,7 +305,7 @@ def _exit_code(study: Study, options: Any, files: Files, line: str) -> int:
 
 
 def _run(study: Study, options: Any, files: Files, line: str) -> int:
-    check_seed("--seed", getattr(options, "seed", 0))
+    check_number("--seed", getattr(options, "seed", 0))
     paths = files(options)
     for path in paths:
         _refuse_foreign(path, line, options.overwrite)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 
-from hpgr.fields import check_seed, show, values_of
+from hpgr.fields import check_number, show, values_of
 from hpgr.scene import Scene, check_scene, field_info
 from studies import command as line
 from studies.command import Report, shown_as
@@ -129,11 +129,13 @@ def optimise(
     ['passing 6 mm >= 60 %']
     """
     check_scene(scene)
-    check_seed("seed", seed)
+    check_number("seed", seed)
     if (minimise is None) == (maximise is None):
         raise ValueError("minimise: give a figure to minimise or one to maximise; such as minimise='specific_energy'")
-    if not over:
-        raise ValueError(f"over: got {over!r:.80}; must be fields and their ranges; such as {{'gap': (0.04, 0.06)}}")
+    if over == {}:
+        raise ValueError(
+            "over: got no fields; give ranges; such as {'gap': ('40 mm', '60 mm')}, or --vary 'gap=40 mm..60 mm'"
+        )
     if not isinstance(subject_to, Mapping | None):
         raise ValueError(f"subject_to: got {subject_to!r:.80}; must be bounds; such as {{'passing 6 mm': '>= 60 %'}}")
     limits = [_limit(name, text) for name, texts in (subject_to or {}).items() for text in np.atleast_1d(texts)]
@@ -362,7 +364,7 @@ def main(options: Options) -> Report:
     for text in options.subject_to:
         name = re.split("[<>]=", text)[0]
         bounds.setdefault(name.strip(), []).append(text[len(name) :])
-    scene, over, run = line.base_scene(options), line.ranges(options.vary), {"threads": options.workers}
+    scene, over, run = line.base_scene(options), line.all_varied(tuple, options.vary), {"threads": options.workers}
     best = optimise(scene, over, options.minimise, options.maximise, bounds, options.seed, progress=True, **run)
     from studies.show.plots.optimum import optimum_figure
 

@@ -157,7 +157,9 @@ def _rows(over: Any) -> tuple[tuple[str, ...], Callable[[np.ndarray], list[tuple
     """Return the fields, and what makes rows of their values of points (point, field) of the unit cube."""
     given = {field_of(name): values for name, values in over.items()}
     if not given:
-        raise ValueError("over: got no fields; give ranges; such as {'gap': ('40 mm', '60 mm')}")
+        raise ValueError(
+            "over: got no fields; give ranges; such as {'gap': ('40 mm', '60 mm')}, or --vary 'gap=40 mm..60 mm'"
+        )
     ranges = ends_of({field: ends for field, ends in given.items() if isinstance(ends, tuple)})
     drawn = {field: np.asarray(ranges.get(field, values), float).ravel() for field, values in given.items()}
     if not all(np.isfinite(values).all() for values in drawn.values()):
@@ -192,7 +194,7 @@ def table(result: "xr.Dataset") -> str:
 @line.command("sensitivity", __doc__)
 def main(options: Options) -> Report:
     """Write the indices of the command line's ranges."""
-    ranges: dict[str, Any] = line.ranges(options.vary) if options.vary or not options.posterior else {}
+    ranges: dict[str, Any] = line.all_varied(tuple, options.vary)
     if options.posterior is not None:
         ranges |= line.posterior(options.posterior)
     figures = options.figures or (*FIGURES, f"passing {options.sieve}")

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hpgr.fields import UNITS, check_seed, parse, show
+from hpgr.fields import UNITS, check_number, parse, show
 
 
 @pytest.mark.parametrize(
@@ -119,9 +119,9 @@ def test_examples_of_units_are_read():
 @pytest.mark.parametrize("value", [-1, 1.0, 1.5, True, 2**63, "0", None])
 def test_seeds_are_whole_numbers_that_a_file_can_hold(value):
     with pytest.raises(ValueError, match=r"seed: got .*; must be a whole number from 0 to"):
-        check_seed("seed", value)
+        check_number("seed", value)
 
 
 def test_good_seeds_pass():
     for value in (0, 2**63 - 1):
-        check_seed("seed", value)
+        check_number("seed", value)

@@ -420,7 +420,7 @@ NO_ARGUMENTS = {
     "rolls.gap, rolls.speed: got [3]; must be a value of each": lambda s, d: sweep(s, {("gap", "speed"): [3]}),
     "scene: got 'best'; must be a scene": lambda s, d: optimise("best", {"gap": (0.04, 0.06)}, "energy"),
     "ranges: got 3; must be fields, each with two ends": lambda s, d: optimise(s, 3, "energy"),
-    "over: got {}; must be fields": lambda s, d: optimise(s, {}, "energy"),
+    "over: got no fields; give ranges; such as": lambda s, d: optimise(s, {}, "energy"),
     "gap: got 0.04; must be lowest and highest value": lambda s, d: optimise(s, {"gap": 0.04}, "energy"),
     "a run has no figure 3; give": lambda s, d: optimise(s, {"gap": (0.04, 0.06)}, maximise=3),
     "subject_to: got 'x'; must be bounds": lambda s, d: optimise(s, {"gap": (0.04, 0.06)}, "energy", subject_to="x"),

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from hpgr.fields import check_count, check_number, check_seed, path_of
+from hpgr.fields import check_number, path_of
 from hpgr.scene import Scene, check_scene
 from studies.sweep.space import Space, SweepSpec, axes_of
 
@@ -114,13 +114,10 @@ def sweep(
         raise ValueError(
             "rolls.gap: got it beside rolls.specific_pressing_force, under which the gap floats; give one of them"
         )
-    check_seed("seed", seed)
-    check_count("replicates", replicates)
-    check_count("threads", threads)
-    check_number("max_cost", max_cost)
-    for name, value in {"tolerance": tolerance, "timeout": timeout}.items():
-        if value is not None:
-            check_number(name, value)
+    given = {"seed": seed, "replicates": replicates, "threads": threads, "max_cost": max_cost}
+    given |= {name: value for name, value in {"tolerance": tolerance, "timeout": timeout}.items() if value is not None}
+    for name, value in given.items():
+        check_number(name, value)
     base = scene.with_values({"resolution.record": record})
     if record != "product" and folder is None:
         raise ValueError(f"folder: got None; record={record!r} needs a folder, which takes a file of each case")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 from pydantic import ValidationError
 
 from hpgr import presets
-from hpgr.fields import check_count, check_number, faults_of, show, unit_shown
+from hpgr.fields import check_number, faults_of, show, unit_shown
 from hpgr.scene import Scene, field_info
 from studies import command as line
 from studies.command import Report, shown_as
@@ -138,14 +138,12 @@ def _run(study: Study, options: Options) -> Report:
 
 
 def _check(options: Options) -> None:
-    check_count("--workers", options.workers)
-    check_count("--replicates", options.replicates)
-    check_number("--max-cost", options.max_cost)
-    if options.timeout is not None:
-        check_number("--timeout", options.timeout)
+    for name in ("workers", "replicates", "max_cost", "timeout", "tolerance"):
+        value = getattr(options, name)
+        if value is not None:
+            check_number(f"--{name.replace('_', '-')}", value)
     if options.tolerance is None:
         return
-    check_number("--tolerance", options.tolerance)
     given = [name for name in ("level", "cells", "points") if getattr(options, name) is not None]
     if given:
         raise ValueError(
