@@ -38,6 +38,7 @@ DENSE = 1 / 64  # swap probability of an edge from which deciding every cell is 
 SMALLEST = 1e-30  # m; a fragment is never 0 nor denormal in float32, and counted as below the size floor
 
 _MARGIN = 1.0 + 1e-6  # covers the rounding of an effective size to float32, 6e-8, and of its exponential
+_LEAST_EXPONENT, _MOST_EXPONENT = 1.0 / HELD[1], 1.0 / HELD[0]  # 1 / gamma(s)
 _NEVER = np.float32(-1.0)  # bound of a cell that may not break, below every critical size ratio
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
@@ -276,7 +277,8 @@ def uniform(state):
 def _weakness(state, ore):
     """Return zeta^(-w/3), P(zeta > x) = exp(-x^k), by the number after the one that a stream is at."""
     power = (-math.log(uniform(mix(state)))) ** (-1.0 / (ore.scatter * ore.scale))
-    return np.float32(min(max(power, 1e-30), 1e30))
+    power = power if power > 1e-30 else 1e-30
+    return np.float32(power if power < 1e30 else 1e30)
 
 
 @_compiled
@@ -360,37 +362,37 @@ def classify(sizes, slot, sieves, k, counts):
 
 
 @_inlined
-def _raise(exponent, count, values, bits, exponents, powers, power_bits):
-    """Raise numbers v > 0 to their exponents, v^e = 2^(e log2 v), where there are any.
+def _raise(count, values, bits, exponents, powers, power_bits):
+    """Raise numbers v > 0 to their exponents, v^e = 2^(e log2 v).
 
     `bits` and `power_bits` are the bits of `values` and of the work space `powers`. In plain arithmetic, which unlike
     calls becomes vectors (40 -> 3 ns a value), to about 1e-13; series in pairs of terms, for a step raises few numbers
     and would wait for a sum of one term after the other.
     """
-    if exponent is not None:
-        for k in range(count):  # mantissa between sqrt(1/2) and sqrt(2), power of 2
-            power = (bits[k] - np.int64(0x3FE6A09E667F3BCD)) >> np.int64(52)
-            bits[k] -= power << np.int64(52)
-            power_bits[k] = power
-        for k in range(count):
-            z = (values[k] - 1.0) / (values[k] + 1.0)
-            y = z * z
-            y2 = y * y
-            y4 = y2 * y2
-            first, second = 2.0 + y * (2 / 3) + y2 * (2 / 5 + y * (2 / 7)), 2 / 9 + y * (2 / 11)
-            logarithm = z * (first + y4 * (second + y2 * (2 / 13 + y * (2 / 15)) + y4 * (2 / 17 + y * (2 / 19))))
-            power = (np.float64(power_bits[k]) + logarithm * 1.4426950408889634) * exponents[k]
-            power = min(max(power, -1000.0), 100.0)
-            whole = np.floor(power + 0.5)
-            r = (power - whole) * 0.6931471805599453
-            r2 = r * r
-            r4 = r2 * r2
-            first, second = 1.0 + r + r2 * (0.5 + r * (1 / 6)), 1 / 24 + r * (1 / 120) + r2 * (1 / 720 + r * (1 / 5040))
-            third = 1 / 40320 + r * (1 / 362880) + r2 * (1 / 3628800 + r * (1 / 39916800))
-            values[k] = first + r4 * (second + r4 * third)
-            power_bits[k] = (np.int64(whole) + np.int64(1023)) << np.int64(52)
-        for k in range(count):
-            values[k] *= powers[k]
+    for k in range(count):  # mantissa between sqrt(1/2) and sqrt(2), power of 2
+        shift = (bits[k] - np.int64(0x3FE6A09E667F3BCD)) >> np.int64(52)
+        bits[k] -= shift << np.int64(52)
+        power_bits[k] = shift
+    for k in range(count):
+        z = (values[k] - 1.0) / (values[k] + 1.0)
+        y = z * z
+        y2 = y * y
+        y4 = y2 * y2
+        first, second = 2.0 + y * (2 / 3) + y2 * (2 / 5 + y * (2 / 7)), 2 / 9 + y * (2 / 11)
+        logarithm = z * (first + y4 * (second + y2 * (2 / 13 + y * (2 / 15)) + y4 * (2 / 17 + y * (2 / 19))))
+        wanted = (np.float64(power_bits[k]) + logarithm * 1.4426950408889634) * exponents[k]
+        above = wanted if wanted > -1000.0 else -1000.0
+        power = above if above < 100.0 else 100.0
+        whole = np.floor(power + 0.5)
+        r = (power - whole) * 0.6931471805599453
+        r2 = r * r
+        r4 = r2 * r2
+        first, second = 1.0 + r + r2 * (0.5 + r * (1 / 6)), 1 / 24 + r * (1 / 120) + r2 * (1 / 720 + r * (1 / 5040))
+        third = 1 / 40320 + r * (1 / 362880) + r2 * (1 / 3628800 + r * (1 / 39916800))
+        values[k] = first + r4 * (second + r4 * third)
+        power_bits[k] = (np.int64(whole) + np.int64(1023)) << np.int64(52)
+    for k in range(count):
+        values[k] *= powers[k]
 
 
 @_inlined
@@ -426,22 +428,18 @@ def _set_bounds(sizes, weakness, slot, bounds, block_bounds, known):
 
 
 @_inlined
-def _list_blocks(needed, block_bounds, active):
-    """List the blocks whose largest bound reaches what is needed; return their number."""
-    actives = 0
+def _list_candidates(needed, bounds, block_bounds, active, places):
+    """List the blocks whose largest bound reaches what is needed, and the places there whose own does.
+
+    Return the number of both.
+    """
+    actives = candidates = 0
     for block in range(0, block_bounds.size, BLOCK):
         actives = _list_above(needed, block_bounds, block, np.uint32(block), active, actives)
-    return actives
-
-
-@_inlined
-def _list_candidates(needed, bounds, active, actives, places):
-    """List the places in active blocks whose bounds reach what is needed; return their number."""
-    candidates = 0
     for k in range(actives):
         first = active[k] * np.uint32(BLOCK) + np.uint32(1)
         candidates = _list_above(needed, bounds, np.int64(first), first, places, candidates)
-    return candidates
+    return actives, candidates
 
 
 @_inlined
@@ -545,25 +543,24 @@ def _draw(streams, places, found, states, ratios):
 def _exponent_of(exponent, size, ore):
     """Return the exponent 1 / gamma(s) of the fragment ratios of a parent of size s, m."""
     power = (np.float64(size) / ore.parent_size) ** ore.size_exponent
-    return min(max(exponent / power, 1.0 / HELD[1]), 1.0 / HELD[0])
+    wanted = exponent / power if exponent / power > _LEAST_EXPONENT else _LEAST_EXPONENT
+    return wanted if wanted < _MOST_EXPONENT else _MOST_EXPONENT
 
 
 @_inlined
-def _exponents(exponent, sizes, places, found, whole, ore, exponents):
-    """Fill the exponents of the parents' fragment ratios, to the end of the last vector."""
+def _raise_ratios(exponent, sizes, streams, places, found, ore, ratios, exponents, work):
+    """Raise the fragment ratios to the exponents of their parents, where there are any.
+
+    The library's power, which the bits are defined by, is taken where ours may give another float32: next to a half.
+    """
     if exponent is not None:
+        whole, doubts = (found + BLOCK - 1) // BLOCK * BLOCK, np.int64(0)
         for k in range(whole):
             exponents[k] = exponent
         if ore.size_exponent != 0.0:
             for k in range(found):
                 exponents[k] = _exponent_of(exponent, sizes[places[k]], ore)
-
-
-@_inlined
-def _settle_powers(exponent, sizes, streams, places, found, ratios, exponents):
-    """Take the library's power, which the bits are defined by, where ours may give another float32: next to a half."""
-    if exponent is not None:
-        doubts = np.int64(0)
+        _raise(whole, ratios, work.ratio_bits, exponents, work.powers, work.power_bits)
         for k in range(found):
             size, ratio = sizes[places[k]], ratios[k]
             doubts += np.float32(size * (ratio * (1.0 - 1e-12))) != np.float32(size * (ratio * (1.0 + 1e-12)))
@@ -634,7 +631,7 @@ def crush(parcels, passage, path, ore, work, record):
     lose what a second core gains (2 threads: 1.0 -> 1.7 times one).
     """
     active, places, before, own, after, weak, verdicts = work[:7]
-    states, ratios, ratio_bits, exponents, powers, power_bits = work[7:]
+    states, ratios = work.states, work.ratios
     log_stress, critical_ratio = path
     sieves, counts = record.sieves, record.counts
     cells, least = parcels.sizes.shape[1] - 2, _least_known(ore)
@@ -650,8 +647,7 @@ def crush(parcels, passage, path, ore, work, record):
                     _set_bounds(sizes, weakness, slot, bounds, block_bounds, least)
                     parcels.bounds_outdated[slot] = False
                 needed = np.float32(critical if critical < 3e38 else 3e38)  # beyond every effective size of float32
-                actives = _list_blocks(needed, block_bounds, active)
-                count = _list_candidates(needed, bounds, active, actives, places)
+                actives, count = _list_candidates(needed, bounds, block_bounds, active, places)
                 _gather(sizes, weakness, slot, places, count, before, own, after, weak)
                 if ore.strength == SIZE_EFFECT:
                     # in whole vectors; what is decided beyond the last candidate is not read
@@ -660,16 +656,14 @@ def crush(parcels, passage, path, ore, work, record):
                         level = log_stress[line, j]
                         _decide_by_logarithms(count, sizes, weakness, slot, places, ore, level, before, verdicts)
                 found = _list_breaks(count, before, verdicts, bounds, places)
-                _count(sizes, places, found, sieves, k, -1, counts)
+                _count(sizes, places, found, sieves, k, np.int64(-1), counts)
                 _draw(streams, places, found, states, ratios)
                 if found and ore.fragments == POWER_LAW:
-                    whole, exponent = (found + BLOCK - 1) // BLOCK * BLOCK, ore.inverse_exponent
-                    _exponents(exponent, sizes, places, found, whole, ore, exponents)
-                    _raise(exponent, whole, ratios, ratio_bits, exponents, powers, power_bits)
-                    _settle_powers(exponent, sizes, streams, places, found, ratios, exponents)
+                    exponent, exponents = ore.inverse_exponent, work.exponents
+                    _raise_ratios(exponent, sizes, streams, places, found, ore, ratios, exponents, work)
                 _draw_strength(streams, weakness, slot, places, found, ore)
                 _break(sizes, weakness, slot, bounds, places, found, least, ratios)
-                _count(sizes, places, found, sieves, k, 1, counts)
+                _count(sizes, places, found, sieves, k, np.int64(1), counts)
                 _renew_blocks(bounds, block_bounds, active, actives, cells)
                 parcels.breaks[slot] += found
             _keep(sizes, counts, k, j, record.snapshots, record.classes)
@@ -697,7 +691,7 @@ def complete(sizes, streams, weakness, critical_ratios, exponent, ore):
                 ratio = uniform(streams[k, p])
                 if exponent is not None:
                     ratio **= exponent if ore.size_exponent == 0.0 else _exponent_of(exponent, size, ore)
-                size = np.float32(max(size * ratio, SMALLEST))
+                size = np.float32(size * ratio if size * ratio > SMALLEST else SMALLEST)
                 if weakness is not None:
                     weak = np.float64(_weakness(streams[k, p], ore))
             sizes[k, p] = size
