@@ -543,6 +543,22 @@ def test_the_mean_field_is_the_mean_of_the_lattice():
     assert np.ptp(coarse) > 0.02  # and they do segregate
 
 
+@pytest.mark.parametrize("ceiling", [0.0, 2.0])
+def test_the_mean_field_swaps_every_pair_of_classes_with_its_chance(ceiling):
+    """One edge, against the sum over all pairs of a class below and a class above."""
+    sizes, shares = np.array([0.01, 0.02, 0.05]), np.array([[0.2, 0.3, 0.5], [0.6, 0.3, 0.1]])
+    means, rise, mixing = shares @ sizes, 4.0, 0.2
+    up, down = (np.maximum(part, 0) for part in (sizes - means[0], means[1] - sizes))
+    up, down = (part / (1 + ceiling * part / math.sqrt(mean)) for part, mean in zip((up, down), means, strict=True))
+    swapped = shares[0][:, None] * shares[1] * (mixing + rise * (up[:, None] + down))
+    wanted = shares + np.array([[1], [-1]]) * (swapped.sum(axis=0) - swapped.sum(axis=1))
+    edges = kernels.Edges(np.array([[0, 1]]), *(np.array([one]) for one in (rise, mixing, ceiling)), np.array([0]))
+    swaps = np.zeros(1)
+    kernels.swap_mean_field(shares, sizes, edges, means, swaps, *np.empty((2, 3)))
+    assert np.allclose(shares, wanted, rtol=1e-12)
+    assert swaps[0] == pytest.approx(swapped.sum(), rel=1e-12)
+
+
 def test_the_mean_field_has_become_steady(monkeypatch):
     """What enters the lattice is within 0.1 % of what four times as many steps give, of feed that segregates."""
     scene = mixed({"resolution.points": 60, "exchange": {"segregation": 1.0, "mixing": 0.02}, "resolution.cells": 2})

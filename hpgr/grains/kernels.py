@@ -89,7 +89,7 @@ class Shares(NamedTuple):
 
     sizes: np.ndarray  # float32 (share, slot, place), m
     weakness: np.ndarray | None  # float32 (share, slot, place), as of parcels
-    totals: np.ndarray  # int64 (share, slot), sum of the sizes, each in whole parts, see `total_of`
+    totals: np.ndarray  # int64 (share, slot), sum of the sizes, each in whole parts
     swapped: np.ndarray  # bool (share, slot), whether cells have swapped since `gather`
 
 
@@ -945,7 +945,6 @@ def swap_mean_field(fractions, sizes, edges, means, swaps, ups, downs):
         lower, upper, mixing = edges.pairs[e, 0], edges.pairs[e, 1], edges.mixing[e]
         drive = _drive(edges.rise[e], mixing, means[lower], means[upper], edges.ceiling[e])
         rise, mixing, below, above, held_below, held_above = drive
-        rising = sinking = mixing
         for c in range(sizes.size):
             ups[c], downs[c] = max(sizes[c] - below, 0.0), max(above - sizes[c], 0.0)
         if held_below > 0.0:  # or else without quotients, which take as long as all the rest
@@ -957,9 +956,7 @@ def swap_mean_field(fractions, sizes, edges, means, swaps, ups, downs):
             sinking += fractions[upper, c] * downs[c]
         rising, sinking = mixing + rise * rising, mixing + rise * sinking
         for c in range(sizes.size):
-            flow = fractions[lower, c] * (mixing + rise * ups[c] + sinking) - fractions[upper, c] * (
-                mixing + rising + rise * downs[c]
-            )
+            flow = fractions[lower, c] * (rise * ups[c] + sinking) - fractions[upper, c] * (rising + rise * downs[c])
             fractions[lower, c] -= flow
             fractions[upper, c] += flow
         swaps[e] += rising + sinking - mixing
