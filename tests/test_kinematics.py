@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numba.core.event import trigger_event
+from numba.core.event import end_event, trigger_event
 from scipy.integrate import quad
 from support import paper, sized
 
@@ -299,3 +299,11 @@ def test_no_garbage_is_collected_while_functions_are_compiled():
             pass
         assert not gc.isenabled()
     assert gc.isenabled()
+    end_event("numba:compile")  # of one that has begun before the package was imported
+    gc.disable()
+    try:
+        with trigger_event("numba:compile"):
+            pass
+        assert not gc.isenabled()  # as the user wished
+    finally:
+        gc.enable()

@@ -23,7 +23,7 @@ _inner = njit(**_HOW, no_cpython_wrapper=True)  # not to be called from Python: 
 
 
 class _Uncollected(event.Listener):
-    """Lets no garbage be collected while numba compiles, here and in the grains: it takes a tenth of the time."""
+    """Lets no garbage be collected while numba compiles, one function at a time: it takes a tenth of the time."""
 
     def __init__(self):
         self.collecting = []
@@ -33,7 +33,7 @@ class _Uncollected(event.Listener):
         gc.disable()
 
     def on_end(self, _):
-        if self.collecting.pop():
+        if self.collecting and self.collecting.pop():  # another thread may have compiled when this was imported
             gc.enable()
 
 
