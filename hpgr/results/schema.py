@@ -180,6 +180,7 @@ def to_dataset(values: Mapping[str, Any], attrs: Mapping[str, Any], own: Mapping
 
     `own` has the variables of a study that no simulation has; one along a dimension of its own name is a coordinate.
     """
+    import pandas as pd
     import xarray as xr  # late: 0.4 s that a sweep's cases and a machine's gap need not wait for
 
     table = {**COORDINATES, **VARIABLES, **SWEEP, **own}
@@ -187,9 +188,12 @@ def to_dataset(values: Mapping[str, Any], attrs: Mapping[str, Any], own: Mapping
     data = [name for name in given if name not in COORDINATES and name not in table[name].dims]
     made = {}
     for name in [*data, *(name for name in given if name not in data)]:
-        row = table[name]
-        # fastpath: a look whether the values are of dask would import it, 0.3 s of the first simulation
-        made[name] = xr.Variable(row.dims, _stored(given[name], row.dtype), row.attributes(), fastpath=True)
+        row, stored = table[name], _stored(given[name], table[name].dtype)
+        # neither asks xarray whether the values are of dask or pint, whose import was 0.4 s of the first simulation
+        if row.dims == (name,) and stored.dtype.kind in "if":
+            made[name] = xr.Variable(row.dims, pd.Index(stored), row.attributes())
+        else:
+            made[name] = xr.Variable(row.dims, stored, row.attributes(), fastpath=True)
     # all as coordinates first: xr.Dataset(data, coords), which looks for what must be merged, takes a sixth longer
     found = xr.Coordinates(made).to_dataset().reset_coords(data)
     found.attrs.update(attrs)
