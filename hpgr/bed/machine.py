@@ -18,8 +18,9 @@ _NARROWEST = 1e-4  # gap over diameter below which no operating gap is looked fo
 _PRECISION = 1e-9  # relative, of the force that an operating gap is found for
 _NO_FORCE = 1e-6  # of the wanted force; less counts as this much
 _CARRIED = 1e-6  # relative error of the force at the gap found
-_HALVES = 4  # steps of a search that are the same for any force
 _TRIED = 65  # gaps among which the bed that presses most is looked for
+_FIRST = 4  # of a search are among these, the same for any force nearby
+_NEAREST = 4  # values that are interpolated between
 
 
 class Performance(NamedTuple):
@@ -137,22 +138,23 @@ def _gap_carrying(inputs: BedInputs, wanted: float) -> float:
             f"{show(narrow, 'm')}, below which {below}; begin the bed higher"
         )
 
-    force = _force_at(inputs)
+    force, low, high = _force_at(inputs), math.log(narrow), math.log(wide)
 
-    def excess(log_gap: float) -> float:  # nearly straight in logs; without any force it is far below
-        return math.log(max(force(log_gap) / wanted, _NO_FORCE))
+    def excess(share: float) -> float:  # nearly straight in logs; without any force it is far below
+        return math.log(max(force(low + share * (high - low)) / wanted, _NO_FORCE))
 
-    low, high = math.log(narrow), math.log(wide)
-    if force(low) < wanted:  # a bed so narrow that it lies between points is not pressed
-        low, below = max(np.linspace(low, high, _TRIED).tolist(), key=force), "points are too few, or " + below
-    if not force(low) >= wanted >= force(high):
+    found = low + _root(excess) * (high - low)
+    if abs(force(found) / wanted - 1) > _PRECISION and force(low) < wanted:  # so narrow that it lies between points
+        tried = [low + share * (high - low) for share in np.linspace(0, 1, _TRIED).tolist()]
+        low, below = max(tried, key=force), "points are too few, or " + below
+        found = low + _root(excess) * (high - low)
+    if abs(force(found) / wanted - 1) > _PRECISION and not force(low) >= wanted >= force(high):
         raise ValueError(
             f"{_refused(wanted)} within the reachable {show(force(high), 'Pa')} (gap {show(wide, 'm')}) to "
             f"{show(force(low), 'Pa')} (gap {show(math.exp(low), 'm')}, below which {below}); choose a force within, "
             "or another bulk modulus (the default is that of loose sand; base = 'industrial' has an ore's), nip angle "
             "or entry gap"
         )
-    found = _root(excess, low, high)
     if abs(force(found) / wanted - 1) > _CARRIED:
         jump = [show(force(found + side * _PRECISION), "Pa") for side in (1, -1)]
         raise ValueError(
@@ -164,31 +166,35 @@ def _gap_carrying(inputs: BedInputs, wanted: float) -> float:
 
 @lru_cache(16)
 def _force_at(inputs: BedInputs) -> Callable[[float], float]:
-    """Return the force over diameter and width, Pa, as a function of the log of the gap, m.
+    """Return the force over diameter and width, Pa, as a function of the log of the gap, m; it keeps what it has found.
 
-    It keeps what it has found: of the nine gaps that a search takes, six are the same for any force.
+    Of the six or seven gaps that a search takes, four are the same for any force nearby.
     """
     return lru_cache(64)(lambda log_gap: _force_over_diameter(inputs._replace(gap=math.exp(log_gap))))
 
 
-def _root(function: Callable[[float], float], low: float, high: float) -> float:
-    """Return where a falling function changes its sign: by halves, then by inverse quadratic interpolation (Brent).
+def _root(function: Callable[[float], float]) -> float:
+    """Return where from 0 to 1 a falling function changes its sign, by inverse interpolation; else the end next to it.
 
-    Halves first, whose ends do not depend on the force. Where interpolation does not gain, as at a jump, by halves too.
+    First among places that do not depend on how far it has to fall. Where interpolation leads nowhere or does not
+    gain, as at a jump, to an end not yet seen, then by halves.
     """
-    known = [(function(low), low), (function(high), high)]
-    halves, found = _HALVES, math.inf
-    while abs(found) >= _PRECISION and high - low >= _PRECISION / 1000:
-        guess, last = (low + high) / 2, found
-        if halves == 0:
-            nearest = sorted(known, key=lambda one: abs(one[0]))[:3]
-            between = _inverse(nearest)
-            guess = between if low < between < high else guess
-        found = function(guess)
-        halves = halves - 1 if halves > 0 else int(abs(found) > abs(last) / 2)
-        known.append((found, guess))
-        low, high = (guess, high) if found > 0 else (low, guess)
-    return min(known, key=lambda one: abs(one[0]))[1]
+    known: dict[float, float] = {}
+    low, high, guess, last, gains = 0.0, 1.0, 0.5, math.inf, True
+    while True:
+        value = known[guess] = function(guess)
+        low, high = (guess, high) if value > 0 else (low, guess)
+        nearest = sorted(known, key=lambda at: abs(known[at]))
+        if abs(value) < _PRECISION or high - low < _PRECISION / 10_000:
+            return next(at for at in nearest if at in (low, high))
+        gains, last = not gains or len(known) <= _FIRST or abs(value) <= abs(last) / 2, value
+        guess = between = _inverse([(known[at], at) for at in nearest[:_NEAREST]])
+        if len(known) < _FIRST:
+            guess -= math.remainder(between, 1 / (_TRIED - 1))
+            guess = guess if low < guess < high else between
+        if len(known) == 1 or not gains or not low < guess < high:
+            unseen = [end for end in (low, high) if end not in known and len(known) > 1]
+            guess = unseen[0] if unseen else (low + high) / 2
 
 
 def _inverse(known: list[tuple[float, float]]) -> float:
