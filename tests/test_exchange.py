@@ -202,6 +202,7 @@ def test_substeps_by_hand():
     assert lattice.substeps_needed(rates, rates.mixing, np.full(3, 0.02), 0.06).tolist() == [3, 3]
     rates = SwapRates(np.array([[0, 1], [2, 3]]), np.zeros(2), np.array([0.5, 0.51]), np.zeros(2))
     assert lattice.substeps_needed(rates, rates.mixing, np.full(4, 0.02), 0.06).tolist() == [1, 2]
+    assert lattice.substeps_needed(rates, np.full(2, 1e25), np.full(4, 0.02), 0.06).min() == 10**18  # and no wrap
 
 
 def test_segregation_counts_with_the_largest_grain_below_and_dust_above():

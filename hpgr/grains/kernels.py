@@ -710,7 +710,7 @@ def split(pairs, rise, mixing, means, largest, largest_sum, sums, substeps):
         sums[upper] += most
     for e in range(substeps.size):
         most = max(sums[pairs[e, 0]], sums[pairs[e, 1]])
-        substeps[e] = max(math.ceil(most / largest_sum), 1.0)
+        substeps[e] = max(math.ceil(min(most / largest_sum, 1e18)), 1.0)  # beyond 9e18 no integer would hold it
 
 
 @_compiled
