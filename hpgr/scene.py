@@ -512,7 +512,7 @@ def field_info(name: str) -> FieldInfo:
     """
     part, field = _find_field(name)
     key, extra = name.rpartition(".")[2], field.json_schema_extra or {}
-    text = re.split("[;:]", meanings(part)[key].rstrip("."))[0]
+    text = re.split("[;:]", meanings(part).get(key, key).rstrip("."))[0]
     return FieldInfo(extra.get("unit", "1"), extra.get("symbol", key), text)
 
 
@@ -531,7 +531,14 @@ def field_value(name: str, value: Any) -> Any:
         If a scene has no such field, or the field refuses the value.
     """
     part, _ = _find_field(name)
-    key = name.rpartition(".")[2]
+    section, _, key = name.partition(".")
+    kinds = [kind for law in _parts(section) for kind in kinds_of(law)] if key == "kind" else []
+    if isinstance(value, str) and value in kinds:
+        return value
+    if kinds:
+        raise ValueError(
+            f"{name}: got {value!r:.80}; must be one of {', '.join(map(repr, kinds))}; choose one of these"
+        )
     try:
         return valid_alone(part, key, value)
     except ValidationError as error:

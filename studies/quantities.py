@@ -88,8 +88,11 @@ def with_sieves(scene: Scene, quantities: Iterable[Quantity]) -> Scene:
     quantities = list(quantities)
     sieves = {one.sieve for one in quantities if one.sieve is not None}
     values = {"resolution.sieves": sorted({*scene.resolution.sieves, *sieves}), "resolution.record": "product"}
-    if not any(one.of_product for one in quantities):
+    product = next((one for one in quantities if one.of_product), None)
+    if product is None:
         values["resolution.cells"] = 0
+    elif scene.resolution.cells == 0:
+        raise ValueError(f"resolution.cells: got 0 (stress only); must be at least 1 for {product.words}; such as 1000")
     return scene.with_values(values)
 
 

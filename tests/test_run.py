@@ -421,6 +421,9 @@ NO_ARGUMENTS = {
     "scene: got 'best'; must be a scene": lambda s, d: optimise("best", {"gap": (0.04, 0.06)}, "energy"),
     "ranges: got 3; must be fields, each with two ends": lambda s, d: optimise(s, 3, "energy"),
     "over: got no fields; give ranges; such as": lambda s, d: optimise(s, {}, "energy"),
+    "resolution.cells: got 0 (stress only); must be at least 1 for P80": lambda s, d: optimise(
+        s.with_values({"resolution.cells": 0}), {"gap": (0.04, 0.06)}, "energy"
+    ),
     "gap: got 0.04; must be lowest and highest value": lambda s, d: optimise(s, {"gap": 0.04}, "energy"),
     "a run has no figure 3; give": lambda s, d: optimise(s, {"gap": (0.04, 0.06)}, maximise=3),
     "subject_to: got 'x'; must be bounds": lambda s, d: optimise(s, {"gap": (0.04, 0.06)}, "energy", subject_to="x"),

@@ -91,6 +91,15 @@ def test_what_is_no_space_is_refused(space, words):
         axes_of(space)
 
 
+def test_laws_are_an_axis_by_their_kinds(base, client):
+    with pytest.raises(ValueError, match=r"feed\.kind: got 'square'; must be one of 'uniform', 'single', 'power_law'"):
+        axes_of({"feed.kind": ["square"]})
+    found = sweep(base, {"flow.kind": ["power", "nip"]}, client=client)
+    assert found["flow_kind"].values.tolist() == ["power", "nip"]
+    assert [int(status) == STATUS["ok"] for status in found["status"].values.ravel()] == [True, False]
+    assert "nip_angle" in found["message"].values[1, 0]  # which the paper's scene has not
+
+
 def test_a_sample_is_a_sweep_like_any_other(base, client, tmp_path):
     """Every place holds its own case, in the result, in the file, read back, opened whole and on the page."""
     rows = [(0.05, 2.0), (0.04, 1.5), (0.05, 2.0)]  # the last is the first again, as of a posterior
