@@ -140,7 +140,7 @@ def _gap_carrying(inputs: BedInputs, wanted: float) -> float:
 
     force, low, high = _force_at(inputs), math.log(narrow), math.log(wide)
 
-    def excess(share: float) -> float:  # nearly straight in logs; without any force it is far below
+    def excess(share: float) -> float:  # nearly straight in the log of the share; without any force it is far below
         return math.log(max(force(low + share * (high - low)) / wanted, _NO_FORCE))
 
     found = low + _root(excess) * (high - low)
@@ -168,13 +168,13 @@ def _gap_carrying(inputs: BedInputs, wanted: float) -> float:
 def _force_at(inputs: BedInputs) -> Callable[[float], float]:
     """Return the force over diameter and width, Pa, as a function of the log of the gap, m; it keeps what it has found.
 
-    Of the six or seven gaps that a search takes, four are the same for any force nearby.
+    Of the five to seven gaps that a search takes, four are the same for any force nearby.
     """
     return lru_cache(64)(lambda log_gap: _force_over_diameter(inputs._replace(gap=math.exp(log_gap))))
 
 
 def _root(function: Callable[[float], float]) -> float:
-    """Return where from 0 to 1 a falling function changes its sign, by inverse interpolation; else the end next to it.
+    """Return where from 0 to 1 a function falls past 0, by inverse interpolation in logs; else the end next to it.
 
     First among places that do not depend on how far it has to fall. Where interpolation leads nowhere or does not
     gain, as at a jump, to an end not yet seen, then by halves.
@@ -188,7 +188,8 @@ def _root(function: Callable[[float], float]) -> float:
         if abs(value) < _PRECISION or high - low < _PRECISION / 10_000:
             return next(at for at in nearest if at in (low, high))
         gains, last = not gains or len(known) <= _FIRST or abs(value) <= abs(last) / 2, value
-        guess = between = _inverse([(known[at], at) for at in nearest[:_NEAREST]])
+        between = _inverse([(known[at], math.log(at)) for at in nearest[:_NEAREST] if at > 0])
+        guess = between = math.exp(min(between, 1.0))
         if len(known) < _FIRST:
             guess -= math.remainder(between, 1 / (_TRIED - 1))
             guess = guess if low < guess < high else between
