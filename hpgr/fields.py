@@ -95,7 +95,7 @@ def parse(text: str, unit: str) -> float:
         If the text is not one number and its unit, or the unit has another dimension.
     """
     known = UNITS[unit]
-    found = _QUANTITY.fullmatch(text)
+    found = isinstance(text, str) and _QUANTITY.fullmatch(text)
     if not found:
         raise ValueError(f"not a number and a unit; write it like '{known.example}'")
     number, named = float(found[1]), _POWER.sub("^", (found[2] or "").translate(_WRITTEN))

@@ -5,6 +5,7 @@ import pytest
 import xarray as xr
 from support import plain_industrial
 
+import hpgr
 import studies.show.plant  # noqa: F401
 from studies.show.report import operating_points
 from studies.sweep import netcdf, sweep
@@ -35,9 +36,30 @@ def test_plant_units(sweeps):
     assert sweeps[0]["gap"].attrs["units"] == "m"
 
 
+def test_reduction_ratio_of_a_sweep_is_that_of_its_cases(sweeps):
+    """The feed is the same everywhere; where it is not, the base scene's must not be taken for all."""
+    base = hpgr.Scene.model_validate_json(sweeps[0].attrs["scene"])
+    alone = hpgr.reduction_ratio(hpgr.simulate(base.with_values({"rolls.gap": "55 mm"})), total=True)
+    assert hpgr.reduction_ratio(sweeps[0], total=True).sel(gap=0.055, replicate=0) == pytest.approx(
+        float(alone), rel=1e-6
+    )
+    for space in ({"scene": {"one": base, "same": base}}, {"feed.top_size": ["30 mm", "40 mm"]}):
+        with pytest.raises(ValueError, match=r"the Dataset sweeps \w+, but holds the feed of its base"):
+            hpgr.reduction_ratio(sweep(base, space))
+
+
 def test_table_and_figure(sweeps):
     assert "throughput [t/h]" in sweeps[0].hpgr.table("6 mm")
     assert sweeps[0].hpgr.plot().axes
+    for wrong in (sweeps[0].hpgr.plant_units(), sweeps[0].drop_attrs()):
+        with pytest.raises(ValueError, match="must be one; such as sweep"):
+            wrong.hpgr.table()
+    with pytest.raises(ValueError, match="got sieves in another unit; must be in m"):
+        hpgr.reduction_ratio(sweeps[0].hpgr.plant_units())
+    with pytest.raises(ValueError, match="got a sweep of no axis"):
+        sweeps[0].assign_attrs(axes="").hpgr.plot()
+    with pytest.raises(ValueError, match="sieve: got 3; not a number and a unit"):
+        sweeps[0].hpgr.plot(3)
 
 
 def test_means_leave_flags_and_words_out(sweeps):

@@ -144,7 +144,7 @@ def reduction_ratio(dataset: xr.Dataset, percent: float = 80, total: bool = Fals
     Raises
     ------
     ValueError
-        If the Dataset is of a sweep over the feed, whose scene has one feed only.
+        If the Dataset is of a sweep over feeds or scenes, and holds the feed of its base scene only.
 
     Examples
     --------
@@ -155,7 +155,8 @@ def reduction_ratio(dataset: xr.Dataset, percent: float = 80, total: bool = Fals
     """
     check_number("percent", percent)
     _require(dataset)
-    swept = [name for name, axis in dataset.coords.items() if axis.attrs.get("scene_field", "").startswith("feed.")]
+    fields = {name: axis.attrs.get("scene_field", "") for name, axis in dataset.coords.items() if axis.dims}
+    swept = [name for name, field in fields.items() if field.startswith("feed.") or name == "scene"]
     if swept:
         raise ValueError(
             f"the Dataset sweeps {swept[0]}, but holds the feed of its base scene only; take feed.quantile of "
@@ -208,6 +209,8 @@ def _require_sizes(dataset: xr.Dataset, point: int) -> None:
     _require(dataset)
     if "passing" not in dataset:
         raise ValueError("the Dataset holds no sizes: it is stress only (resolution.cells = 0); simulate it with cells")
+    if dataset["sieve"].attrs.get("units", "m") != "m":  # plant units, of which a size of 1 mm would be taken for 1 m
+        raise ValueError("dataset: got sieves in another unit; must be in m; such as hpgr.simulate(scene) returns them")
     if not isinstance(point, numbers.Integral) or isinstance(point, bool):
         raise ValueError(f"point: got {point!r}; must be a whole number; take -1 for the exit")
     points = dataset.sizes.get("point")

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from hpgr.fields import parse, unit_shown
+from hpgr.fields import unit_shown
+from studies.command import quantity_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,14 +47,23 @@ class Plant:
         """Return the table of a sweep, a line for each operating point, as its command prints it."""
         from studies.show import report
 
-        return report.table(self._dataset, parse(sieve, "m"))
+        return report.table(self._sweep(), quantity_of("sieve", sieve, "m"))
 
     def plot(self, sieve: str = "1 mm") -> "Figure":
         """Return the figure of a sweep, as its command draws it."""
         from studies.show import report
 
-        field = self._dataset.attrs["axes"].partition(",")[0]
-        return picture(self._dataset, field, parse(sieve, "m"), "\n".join(report.change(self._dataset, field)))
+        result, size = self._sweep(), quantity_of("sieve", sieve, "m")
+        field = result.attrs["axes"].partition(",")[0]
+        if not field:
+            raise ValueError("dataset: got a sweep of no axis; must have one to be drawn; such as {'gap': ['40 mm']}")
+        return picture(result, field, size, "\n".join(report.change(result, field)))
+
+    def _sweep(self) -> xr.Dataset:
+        found = self._dataset
+        if "axes" not in found.attrs or found["throughput"].attrs["units"] != "kg s-1":
+            raise ValueError("dataset: got no sweep in SI units; must be one; such as sweep(scene, {'gap': ['40 mm']})")
+        return found
 
 
 def picture(result: xr.Dataset, field: str, sieve: float, words: str) -> "Figure":
