@@ -291,14 +291,12 @@ def start_parcels(bases, ore, slots, uniforms, streams, weakness):
     cells = uniforms.shape[1]
     for k in range(slots.size):
         slot = slots[k]
-        for p in range(1, cells + 1):
-            streams[slot, p] = mix(bases[k, 0] + np.uint64(p) * _GOLDEN)
-        if weakness is not None:
-            for p in range(1, cells + 1):
-                weakness[slot, p] = _weakness(streams[slot, p], ore)
-        state = bases[k, 1]
         for p in range(cells):
             uniforms[k, p] = p
+            streams[slot, p + 1] = mix(bases[k, 0] + np.uint64(p + 1) * _GOLDEN)
+            if weakness is not None:
+                weakness[slot, p + 1] = _weakness(streams[slot, p + 1], ore)
+        state = bases[k, 1]
         for p in range(cells - 1, 0, -1):
             state += _GOLDEN
             q = np.int64(uniform(state) * (p + 1))
@@ -396,33 +394,25 @@ def _raise(count, values, bits, exponents, powers, power_bits):
 
 
 @_inlined
-def _least_known(ore):
-    """Return what `_unshielded` takes of the ore, in float32: what of it is rounded, the margin covers."""
-    sized = ore.inverse_size > 0.0  # without size effect every size may break
-    return (
-        np.float32(ore.inverse_size * _MARGIN),
-        np.float32(0.0 if sized else _MARGIN),
-        np.float32(ore.size_floor),
-    )
+def _unshielded(sizes, weakness, slot, p, ore):
+    """Return the bound of a cell whose neighbourhood is new; nothing below the floor ever breaks.
 
-
-@_inlined
-def _unshielded(sizes, weakness, slot, p, known):
-    """Return the bound of a cell whose neighbourhood is new; nothing below the floor ever breaks."""
-    per_size, flat, floor = known
-    bound = sizes[p] * per_size + flat
+    The constants are float32: what of them is rounded, the margin covers.
+    """
+    # without size effect every size may break
+    bound = sizes[p] * np.float32(ore.inverse_size * _MARGIN) + np.float32(0.0 if ore.inverse_size > 0.0 else _MARGIN)
     if weakness is not None:
         bound *= weakness[slot, p]
-    return bound if sizes[p] >= floor else _NEVER
+    return bound if sizes[p] >= np.float32(ore.size_floor) else _NEVER
 
 
 @_inner
-def _set_bounds(sizes, weakness, slot, bounds, block_bounds, known):
+def _set_bounds(sizes, weakness, slot, bounds, block_bounds, ore):
     """Set the bounds of a line of cells whose neighbourhoods are all new."""
     cells = sizes.size - 2
     sizes[0], sizes[cells + 1] = sizes[cells], sizes[1]
     for p in range(bounds.size):
-        bounds[p] = _unshielded(sizes, weakness, slot, np.uint64(p), known) if 1 <= p <= cells else _NEVER
+        bounds[p] = _unshielded(sizes, weakness, slot, np.uint64(p), ore) if 1 <= p <= cells else _NEVER
     for block in range(block_bounds.size):
         block_bounds[block] = _largest(bounds, block * BLOCK + 1) if block * BLOCK < cells else _NEVER
 
@@ -571,21 +561,21 @@ def _raise_ratios(exponent, sizes, streams, places, found, ore, ratios, exponent
 
 
 @_inlined
-def _break(sizes, weakness, slot, bounds, places, found, known, ratios):
+def _break(sizes, weakness, slot, bounds, places, found, ore, ratios):
     """Replace each cell that breaks by its fragment; set anew its bound and its neighbours', around the ends too."""
     cells = sizes.size - 2
     for k in range(found):
         p, ratio = np.uint64(places[k]), ratios[k]  # one kind of place to compile `_unshielded` for
         sizes[p] = np.float32(sizes[p] * ratio if sizes[p] * ratio > SMALLEST else SMALLEST)
-        bounds[p - _1] = _unshielded(sizes, weakness, slot, p - _1, known)
-        bounds[p] = _unshielded(sizes, weakness, slot, p, known)
-        bounds[p + _1] = _unshielded(sizes, weakness, slot, p + _1, known)
+        bounds[p - _1] = _unshielded(sizes, weakness, slot, p - _1, ore)
+        bounds[p] = _unshielded(sizes, weakness, slot, p, ore)
+        bounds[p + _1] = _unshielded(sizes, weakness, slot, p + _1, ore)
     sizes[0], sizes[cells + 1] = sizes[cells], sizes[1]
     bounds[0] = bounds[cells + 1] = _NEVER
     if found and places[0] == 1:
-        bounds[cells] = _unshielded(sizes, weakness, slot, np.uint64(cells), known)
+        bounds[cells] = _unshielded(sizes, weakness, slot, np.uint64(cells), ore)
     if found and places[found - 1] == cells:
-        bounds[1] = _unshielded(sizes, weakness, slot, _1, known)
+        bounds[1] = _unshielded(sizes, weakness, slot, _1, ore)
 
 
 @_inner
@@ -634,7 +624,7 @@ def crush(parcels, passage, path, ore, work, record):
     states, ratios = work.states, work.ratios
     log_stress, critical_ratio = path
     sieves, counts = record.sieves, record.counts
-    cells, least = parcels.sizes.shape[1] - 2, _least_known(ore)
+    cells = parcels.sizes.shape[1] - 2
     for k in range(passage.slots.size):
         slot, line = passage.slots[k], passage.lines[k]
         sizes, streams = parcels.sizes[slot], parcels.streams[slot]
@@ -644,7 +634,7 @@ def crush(parcels, passage, path, ore, work, record):
             critical = critical_ratio[line, j]
             if critical < np.inf:
                 if parcels.bounds_outdated[slot]:
-                    _set_bounds(sizes, weakness, slot, bounds, block_bounds, least)
+                    _set_bounds(sizes, weakness, slot, bounds, block_bounds, ore)
                     parcels.bounds_outdated[slot] = False
                 needed = np.float32(critical if critical < 3e38 else 3e38)  # beyond every effective size of float32
                 actives, count = _list_candidates(needed, bounds, block_bounds, active, places)
@@ -662,7 +652,7 @@ def crush(parcels, passage, path, ore, work, record):
                     exponent, exponents = ore.inverse_exponent, work.exponents
                     _raise_ratios(exponent, sizes, streams, places, found, ore, ratios, exponents, work)
                 _draw_strength(streams, weakness, slot, places, found, ore)
-                _break(sizes, weakness, slot, bounds, places, found, least, ratios)
+                _break(sizes, weakness, slot, bounds, places, found, ore, ratios)
                 _count(sizes, places, found, sieves, k, np.int64(1), counts)
                 _renew_blocks(bounds, block_bounds, active, actives, cells)
                 parcels.breaks[slot] += found
