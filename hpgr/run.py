@@ -172,9 +172,9 @@ def _fields(bed: LoadedBed) -> dict[str, Any]:
     return {name: field for name, field in state.items() if name in schema.VARIABLES} | {
         # copies of what is stored as it is, for a bed may be kept and a Dataset's arrays are its user's
         "xi": bed.geometry.xi.copy(),
-        "x": motion.x.copy(),
+        "x": bed.geometry.x(motion.y),
         "height": motion.y.copy(),
-        "residence_time": np.tile(motion.residence_time, (motion.x.shape[0], 1)),
+        "residence_time": np.tile(motion.time_step * np.arange(motion.y.shape[1]), (motion.y.shape[0], 1)),
         "speed": motion.speed,
         "volumetric_strain_rate": motion.volumetric_rate,
         "shear_strain_rate": motion.shear_rate,

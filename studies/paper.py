@@ -188,7 +188,7 @@ def _fields(scene: Scene) -> dict[str, Any]:
     motion, strains = kinematics.move(bed, flow, inputs.surface_speed, inputs.stress_points)
     state = stress.load(*solid, motion, strains)
     found = {
-        "x": motion.x,
+        "x": bed.x(motion.y),
         "height": motion.y,
         "speed": motion.speed,
         "volumetric_strain_rate": motion.volumetric_rate,
@@ -213,7 +213,7 @@ def _shown(shown: Scene) -> dict[str, Any]:
     corners = np.concatenate([outline for _, outline in pieces])
     numbers = np.arange(len(pieces), dtype=np.int32)
     return {
-        "shown_x": mirrored(motion.x, odd=True),
+        "shown_x": mirrored(bed.geometry.x(motion.y), odd=True),
         "shown_height": mirrored(motion.y),
         "volume": mirrored(cells.volume),
         "shown_time_step": motion.time_step,

@@ -19,7 +19,7 @@ exponents = pytest.mark.parametrize("c", [0.3, 0.5, 1.0, 2.0])
 def loaded_path(scene, steps, volumetric_rate, time_step):
     """March one streamline through the strains of `steps`; positions do not matter to the stress."""
     still, rate = np.zeros((1, len(volumetric_rate))), np.asarray(volumetric_rate, float)[None]
-    motion = Kinematics(still, still, still[0], still, rate, *[still] * 3, time_step)
+    motion = Kinematics(still, still, rate, *[still] * 3, time_step)
     _, *elastic = inputs_of(scene).laws()
     return stress.load(*elastic, motion, StepStrains(*(np.append(0.0, step)[None] for step in steps)))
 

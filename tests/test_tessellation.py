@@ -26,13 +26,14 @@ def laid(scene):
     bed = load_bed(inputs)
     edges = bed.geometry._replace(xi=np.array([0.0, 1.0]))
     rim, _ = kinematics.move(edges, inputs.laws()[0], inputs.surface_speed, inputs.points)
-    return bed.geometry, bed.kinematics.x, bed.kinematics.y, rim.y[:, 0]
+    return bed.geometry, bed.geometry.x(bed.kinematics.y), bed.kinematics.y, rim.y[:, 0]
 
 
 def tiled(scene):
     """Points (streamline x point, 2) and their tessellation."""
     bed = load_bed(inputs_of(scene, tessellated=True))
-    return np.column_stack([bed.kinematics.x.ravel(), bed.kinematics.y.ravel()]), bed.tessellation
+    x, y = bed.geometry.x(bed.kinematics.y), bed.kinematics.y
+    return np.column_stack([x.ravel(), y.ravel()]), bed.tessellation
 
 
 def clipped_bisectors(points, domain):

@@ -24,6 +24,10 @@ class Geometry(NamedTuple):
         """Return X(y), the half width of the bed at height y, m."""
         return self.half_gap + y * y * (self.b + self.c * y)
 
+    def x(self, y):
+        """Return the distance from the mid-plane, m, of points at heights y, (streamline, point)."""
+        return self.xi[:, None] * self.outer(y)
+
     def slope(self, y):
         """Return X'(y)."""
         return y * (2 * self.b + 3 * self.c * y)

@@ -10,6 +10,7 @@ from hpgr.bed.geometry import Geometry
 from hpgr.laws.flow import FlowConstants
 
 _PANELS = np.linspace(0.0, 1.0, 65)  # panels of quadrature, see hpgr.bed.kernels
+_TO_NIP, _TO_TOP = 1 - abs(1 - 2 * _PANELS), np.maximum(2 * _PANELS - 1, 0.0)  # half of them below a nip
 _CLOSEST = 1e-9  # spacing of points, as a fraction of the bed's height, below which they are one point
 
 
@@ -20,9 +21,7 @@ class Kinematics(NamedTuple):
     compaction. With stress and strain rate coaxial the normal stress on the streamline is p + 2 q / 3 times this.
     """
 
-    x: np.ndarray  # distance from the mid-plane, m
     y: np.ndarray  # height above the minimum gap, m
-    residence_time: np.ndarray  # (point,) since the first point, s; the same on every streamline
     speed: np.ndarray  # along the streamline, m/s
     volumetric_rate: np.ndarray  # of strain, 1/s; compaction positive
     shear_rate: np.ndarray  # of triaxial shear strain, 1/s
@@ -46,14 +45,13 @@ def move(geometry: Geometry, flow: FlowConstants, surface_speed: float, points: 
     y, speed, *rates, across, flux, volumetric, shear = np.zeros((8, geometry.xi.size, points))
     time_step = 0.0
     if geometry.height > 0:
-        nip, edges = nip_height(geometry, flow), _panels(geometry, flow)
+        nip = nip_height(geometry, flow)
         laid = np.empty(points), y, speed, *rates, across, flux, volumetric, shear
-        time_step, closest = kernels.lay(geometry, nip, flow, surface_speed, edges, *laid)
+        time_step, closest = kernels.lay(geometry, nip, flow, surface_speed, _panels(geometry, flow, nip), *laid)
         _refuse_coinciding(closest / geometry.height, points, flow.entry_fraction)
     else:  # gap = entry gap: no bed to compact; every point is the exit
         speed += surface_speed
-    x, residence_time = geometry.xi[:, None] * geometry.outer(y), np.arange(points) * time_step
-    return Kinematics(x, y, residence_time, speed, *rates, across, flux, time_step), StepStrains(volumetric, shear)
+    return Kinematics(y, speed, *rates, across, flux, time_step), StepStrains(volumetric, shear)
 
 
 def nip_height(geometry: Geometry, flow: FlowConstants) -> float:
@@ -61,14 +59,13 @@ def nip_height(geometry: Geometry, flow: FlowConstants) -> float:
     return min(geometry.radius * math.sin(flow.nip_angle), geometry.height) if flow.nip_angle else geometry.height
 
 
-def _panels(geometry: Geometry, flow: FlowConstants) -> np.ndarray:
+def _panels(geometry: Geometry, flow: FlowConstants, nip: float) -> np.ndarray:
     """Return the places between panels, exit to entry, on the mid-plane; the speed has a kink at the nip."""
     if flow.nip_angle == 0:
         return _PANELS * -math.log(flow.entry_fraction)
     # high enough, on the mid-plane, that in the same time no tube begins below the nip, already compacted
-    nip = nip_height(geometry, flow)
     top = max(geometry.height * (1 - flow.entry_fraction), nip * math.hypot(1, geometry.slope(nip)))
-    return np.interp(_PANELS, (0.0, 0.5, 1.0), (0.0, nip, top)) / geometry.height
+    return _TO_NIP * (nip / geometry.height) + _TO_TOP * (top / geometry.height)
 
 
 def _refuse_coinciding(spacing: float, points: int, entry_fraction: float) -> None:

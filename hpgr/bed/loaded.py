@@ -40,10 +40,13 @@ class BedInputs(NamedTuple):
         """Return the bed with the streamlines `xi`."""
         return between_rolls(self.diameter, self.gap, self.entry_gap, xi)
 
+    def profile(self) -> FlowConstants:
+        """Return the profile as the kernels take it."""
+        return self.flow.constants(self.gap, self.diameter, self.feed_solid_fraction)
+
     def laws(self) -> tuple[FlowConstants, ElasticConstants, tuple[float, float]]:
         """Return profile, elastic law and solid fractions (feed, at most) as the kernels take them."""
-        flow = self.flow.constants(self.gap, self.diameter, self.feed_solid_fraction)
-        return flow, self.elasticity.constants(), (self.feed_solid_fraction, self.max_solid_fraction)
+        return self.profile(), self.elasticity.constants(), (self.feed_solid_fraction, self.max_solid_fraction)
 
     def mean_pressure(self, geometry: Geometry, y, power: float = 1.0):
         """Return the mean over the roll width of the pressure at height y to a power, relative to its middle's."""
@@ -95,9 +98,7 @@ def load_bed(inputs: BedInputs) -> LoadedBed:
     motion, strains, state = bear(inputs, walled)
     bed = LoadedBed(
         walled._replace(xi=xi),
-        motion._replace(
-            residence_time=motion.residence_time[::every], time_step=every * motion.time_step, **_kept(motion, every)
-        ),
+        motion._replace(time_step=every * motion.time_step, **_kept(motion, every)),
         state._replace(continuity_solid_fraction=state.continuity_solid_fraction[:-1], **_kept(state, every)),
         _press(inputs, walled, motion, strains, state),
         None,
@@ -122,9 +123,9 @@ def force_on_roll(inputs: BedInputs, geometry: Geometry, motion: Kinematics, sta
 
     Past the gap the cake follows the rolls apart until it has recovered; it then adds to the force.
     """
-    flow, _, _ = inputs.laws()
     y, normal = motion.y[-1], _on_roll(motion, state)
-    pressing, low = normal * inputs.mean_pressure(geometry, y), np.minimum(y, kinematics.nip_height(geometry, flow))
+    low = np.minimum(y, kinematics.nip_height(geometry, inputs.profile()))
+    pressing = normal * inputs.mean_pressure(geometry, y)
     recovering = inputs.elasticity.recovering_force(normal[-1], inputs.gap, geometry.radius)
     return float(
         (pressing[1:] + pressing[:-1]) @ (low[:-1] - low[1:]) / 2
@@ -160,7 +161,7 @@ def _press(inputs: BedInputs, geometry: Geometry, motion: Kinematics, strains: S
     if geometry.height == 0:
         return Pressed(0.0, 0.0, 0.0)
     first = int((motion.volumetric_rate[-1] > 0).argmax())
-    onset = inputs.laws()[0].nip_angle or math.asin(motion.y[-1, first] / geometry.radius)
+    onset = inputs.profile().nip_angle or math.asin(motion.y[-1, first] / geometry.radius)
     force, power = force_on_roll(inputs, geometry, motion, state), _power(inputs, geometry, motion, strains, state)
     return Pressed(force, power, onset if (strains.volumetric[-1] > 0).any() else 0.0)
 
@@ -168,8 +169,8 @@ def _press(inputs: BedInputs, geometry: Geometry, motion: Kinematics, strains: S
 def _tessellated(inputs: BedInputs, bed: LoadedBed) -> "Tessellation":
     from hpgr.bed.tessellation import tessellate  # late: only exchange and pictures need GEOS
 
-    rim, _ = kinematics.move(bed.geometry._replace(xi=np.array([0.0, 1.0])), inputs.laws()[0], inputs.surface_speed, 2)
-    return tessellate(bed.geometry, bed.kinematics.x, bed.kinematics.y, rim.y[:, 0])
+    rim, _ = kinematics.move(bed.geometry._replace(xi=np.array([0.0, 1.0])), inputs.profile(), inputs.surface_speed, 2)
+    return tessellate(bed.geometry, bed.geometry.x(bed.kinematics.y), bed.kinematics.y, rim.y[:, 0])
 
 
 class Beds:

@@ -12,7 +12,7 @@ import numpy as np
 
 from hpgr.bed.loaded import BedInputs, Pressed, bear, force_on_roll, inputs_of
 from hpgr.fields import show
-from hpgr.scene import LEAST_GAP, STEEPEST_ENTRY, Scene, check_scene
+from hpgr.scene import LEAST_GAP, STEEPEST_ENTRY, Scene, check_scene, field_value
 
 _NARROWEST = 1e-4  # gap over diameter below which no operating gap is looked for
 _PRECISION = 1e-9  # relative, of the force that an operating gap is found for
@@ -21,6 +21,7 @@ _CARRIED = 1e-6  # relative error of the force at the gap found
 _TRIED = 65  # gaps among which the bed that presses most is looked for
 _FIRST = 4  # of a search are among these, the same for any force nearby
 _NEAREST = 4  # values that are interpolated between
+_ROLL = np.ones(1)  # its streamline
 
 
 class Performance(NamedTuple):
@@ -71,7 +72,7 @@ def specific_pressing_force(scene: Scene) -> float:
 
 
 def _force_over_diameter(inputs: BedInputs) -> float:
-    roll = inputs.between_rolls(np.ones(1))
+    roll = inputs.between_rolls(_ROLL)
     if roll.height == 0:
         return 0.0
     motion, _, state = bear(inputs, roll)
@@ -108,8 +109,7 @@ def operating_gap(scene: Scene, specific_pressing_force: float | str) -> float:
     check_scene(scene)
     if specific_pressing_force is None:  # which a scene may have, as its gap is then its own
         raise ValueError("specific_pressing_force: got None; must be a pressure; such as '3.5 N/mm^2'")
-    held = scene.with_values({"rolls.specific_pressing_force": specific_pressing_force})
-    return float_gap(held).rolls.gap
+    return _gap_carrying(_floating(scene), field_value("rolls.specific_pressing_force", specific_pressing_force))
 
 
 def float_gap(scene: Scene) -> Scene:
@@ -120,10 +120,16 @@ def float_gap(scene: Scene) -> Scene:
     wanted = scene.rolls.specific_pressing_force
     if wanted is None:
         return scene
-    flow = scene.flow.held(scene.rolls.gap, scene.rolls.diameter, scene.bed.feed_solid_fraction)
-    gap = _gap_carrying(inputs_of(scene)._replace(gap=0.0, flow=flow), wanted)
+    inputs = _floating(scene)
+    rolls = scene.rolls.model_copy(update={"gap": _gap_carrying(inputs, wanted)})
     # copies skip validation, which would cost more than the root: its bounds are a scene's
-    return scene.model_copy(update={"rolls": scene.rolls.model_copy(update={"gap": gap}), "flow": flow})
+    return scene.model_copy(update={"rolls": rolls, "flow": inputs.flow})
+
+
+def _floating(scene: Scene) -> BedInputs:
+    """Return what the bed depends on beside the gap, which is 0; what is held while it floats is that of the scene."""
+    flow = scene.flow.held(scene.rolls.gap, scene.rolls.diameter, scene.bed.feed_solid_fraction)
+    return inputs_of(scene)._replace(gap=0.0, flow=flow)
 
 
 @lru_cache(256)
@@ -200,10 +206,13 @@ def _root(function: Callable[[float], float]) -> float:
 
 def _inverse(known: list[tuple[float, float]]) -> float:
     """Return the place at which the polynomial through values at places is 0, taken as a function of the value."""
-    values = {value for value, _ in known}
-    if len(values) < len(known):
+    values, places = [value for value, _ in known], [at for _, at in known]
+    if len(set(values)) < len(values):
         return math.nan
-    return sum(at * math.prod(other / (other - value) for other in values if other != value) for value, at in known)
+    for span in range(1, len(known)):  # Neville's scheme
+        for k, (first, last) in enumerate(zip(values, values[span:], strict=False)):
+            places[k] = (first * places[k + 1] - last * places[k]) / (first - last)
+    return places[0] if places else math.nan
 
 
 def _refused(wanted: float) -> str:

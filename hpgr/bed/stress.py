@@ -32,7 +32,6 @@ def load(
     fields = (*np.empty((5, *rate.shape)), np.empty(rate.shape, bool))
     lowest = kernels.load(elastic, solid, kinematics.time_step, rate, *strains, *fields)
     # explicit steps from zero strain miss what the state functions say there; they do so for c < 0 only
-    clamped = lowest[2] < 0 or any(
-        least < 0 and -least > _TENSION_NOISE * stress.max() for least, stress in zip(lowest, fields[3:5], strict=False)
-    )
+    tension = zip(lowest, fields[3:5], strict=False) if min(lowest) < 0 else ()
+    clamped = lowest[2] < 0 or any(-least > _TENSION_NOISE * stress.max() for least, stress in tension)
     return StressState(*fields, solid[0] * np.exp(fields[0][:, -1]), clamped)
