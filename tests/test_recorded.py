@@ -55,8 +55,12 @@ def test_every_case_is_what_simulate_gives(base, folder, record):
             assert place[name].attrs.keys() == single[name].attrs.keys()
         for name in single.coords:
             assert np.allclose(place[name].values, single[name].values, rtol=1e-7), name
+        for figure in (lambda one: hpgr.percentile_size(one, 70), lambda one: hpgr.passing(one, ["1 mm"], point=3)):
+            found = figure(cases).isel(gap=gap, roll_speed=speed, replicate=replicate)
+            assert found.values == pytest.approx(figure(single).values, rel=1e-6)
     lost = cases.isel(gap=2)
     assert lost["pressure"].isnull().all()
+    assert hpgr.passing(lost, ["1 mm"], point=3).isnull().all()
 
 
 def test_nothing_is_read_before_it_is_needed_and_a_chunk_is_a_case(folder, monkeypatch):

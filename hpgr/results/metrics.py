@@ -55,7 +55,10 @@ def passing(dataset: xr.Dataset, sieves=None, point: int = -1, total: bool = Fal
     if "size" in dataset and not (sieves is None and _is_exit(dataset, point)):
         as_cells = wanted.astype(np.float32)  # a grain of just a sieve's size passes it
         found = _over_cells(
-            lambda row: np.searchsorted(row, as_cells, side="right") / row.size, dataset, point, ("sieve",)
+            lambda row: np.searchsorted(row, as_cells, side="right") / row.size + 0 * row[-1],  # NaN of a lost case
+            dataset,
+            point,
+            ("sieve",),
         ).assign_coords(sieve=wanted)
     else:
         found = _recorded_passing(dataset, point)
@@ -238,7 +241,7 @@ def _over_cells(function, dataset: xr.Dataset, point: int, new_dims=(), total: b
     pooled = ("streamline", "time", "cell") if total else ("time", "cell")
     return xr.apply_ufunc(
         lambda cells: function(np.sort(cells, axis=None)),
-        _steady(dataset["size"]).isel(point=point, drop=True),
+        _steady(dataset["size"]).isel(point=point, drop=True).compute(),  # cases may be lazy
         input_core_dims=[pooled],
         output_core_dims=[new_dims],
         vectorize=True,
@@ -254,7 +257,7 @@ def _recorded_passing(dataset: xr.Dataset, point: int) -> xr.DataArray:
             "simulate with resolution.record 'distributions' or 'cells'"
         )
     mean = _steady(dataset["mass_fraction"]).isel(point=point).mean("time")
-    return mean.cumsum("sieve").assign_coords(sieve=dataset["sieve"])
+    return mean.cumsum("sieve", skipna=False).assign_coords(sieve=dataset["sieve"])
 
 
 def between_sieves(found: xr.DataArray, wanted: np.ndarray) -> xr.DataArray:
@@ -294,4 +297,4 @@ def _percentile_between_sieves(found: xr.DataArray, fraction: float, total: bool
         around = slice(max(first - 1, 0), first + 1)
         return np.exp(np.interp(fraction, fractions[around], log_sieves[around]))
 
-    return xr.apply_ufunc(invert, found, input_core_dims=[["sieve"]], vectorize=True)
+    return xr.apply_ufunc(invert, found.compute(), input_core_dims=[["sieve"]], vectorize=True)
