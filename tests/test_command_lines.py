@@ -20,6 +20,7 @@ from studies.__main__ import commands
 from studies.__main__ import main as any_study
 from studies.sweep import run as running
 from studies.sweep.study import Options
+from studies.sweep.study import _default_values as default_values
 
 SMALL = ["--cells", "60", "--points", "40", "--streamlines", "3"]
 STUDIES = {"gap_sweep": gap_sweep, "speed_sweep": speed_sweep, "feed_sweep": feed_sweep}
@@ -133,6 +134,12 @@ def test_default_gaps_are_those_that_every_scene_can_be_at(run, refused):
     assert result["specific_pressing_force"].max() < 7.2e6  # of `industrial`, twice 3.5 N/mm2
     message = refused("--scene", "khd_pilot", "industrial", "--out", "other.nc")
     assert "at least 55.5 mm and the first has 23.7 mm; such as --gap" in message
+
+
+def test_default_gaps_too_close_for_three_digits_are_given_once():
+    wide = hpgr.presets.industrial()
+    scene = wide.with_values({"rolls.gap": 0.0556})
+    assert default_values(gap_sweep.STUDY, [scene, wide]) == pytest.approx([0.0555, 0.0556, 0.0557], abs=1e-6)
 
 
 def test_further_axes_come_after_the_study_s_own(run):
