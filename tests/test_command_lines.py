@@ -139,7 +139,8 @@ def test_default_gaps_are_those_that_every_scene_can_be_at(run, refused):
 def test_default_gaps_too_close_for_three_digits_are_given_once():
     wide = hpgr.presets.industrial()
     scene = wide.with_values({"rolls.gap": 0.0556})
-    assert default_values(gap_sweep.STUDY, [scene, wide]) == pytest.approx([0.0555, 0.0556, 0.0557], abs=1e-6)
+    assert default_values(gap_sweep.STUDY, [scene, wide]) == pytest.approx([0.0555, 0.0556, 0.0557])
+    assert default_values(speed_sweep.STUDY, [scene])[2] == scene.rolls.speed
 
 
 def test_further_axes_come_after_the_study_s_own(run):

@@ -210,8 +210,8 @@ def _default_values(study: Study, scenes: list[Scene]) -> list[float]:
         own = scene.feed.largest_grain
     shown = unit_shown(field_info(AXES[study.main]).unit)[1]
     factors = _carried(study.factors, scenes) if study.main == "gap" else study.factors
-    found = [own if factor == 1 else float(f"{own * factor * shown:.3g}") / shown for factor in factors]
-    return list(dict.fromkeys(found))  # in three digits those close together are one
+    found = {text: float(text) / shown for text in (f"{own * factor * shown:.3g}" for factor in factors)}
+    return list((found | {f"{own * shown:.3g}": own}).values())  # those that three digits do not tell apart are one
 
 
 def _carried(factors: tuple[float, ...], scenes: list[Scene]) -> tuple[float, ...]:
