@@ -165,7 +165,8 @@ def test_change_is_that_of_pairs(result):
     result["p80_total"] = xr.ones_like(result["p80_total"]) * 0.001 * noise
     result["p80_total"][{"gap": 0}] *= 2
     assert report.change(result, "rolls.gap") == [
-        "P80 changes by +100 ± 0 % from gap 40 mm to gap 60 mm (mean ± standard error of pairs)."
+        "P80 changes by +100 ± 0 % from gap 40 mm to gap 60 mm (mean ± standard error of pairs), "
+        "on average over roll speed."
     ]
 
 

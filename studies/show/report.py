@@ -242,7 +242,7 @@ def flagged(result: xr.Dataset) -> list[str]:
 def change(result: xr.Dataset, field: str) -> list[str]:
     """Return a line on how much P80 changes from end to end of the axis of a scene field, if it can be told.
 
-    Replicates share their random numbers along an axis, so the change is that of pairs; other axes are averaged.
+    Replicates share their random numbers along an axis, so the change is that of pairs; the mean over other axes.
     """
     axes = (result[name] for name in axes_of(result) if result[name].attrs.get("scene_field") == field)
     axis = next(axes, None)
@@ -251,7 +251,8 @@ def change(result: xr.Dataset, field: str) -> list[str]:
     order = np.argsort(axis.values)
     p80 = result["p80_total"].astype(float).isel({axis.name: order})
     ratio = 100 * (p80.isel({axis.name: -1}) / p80.isel({axis.name: 0}) - 1)
-    ratio = ratio.mean([name for name in ratio.dims if name != "replicate"])
+    others = [name for name in ratio.dims if name != "replicate"]
+    ratio = ratio.mean(others)
     count = int(ratio.notnull().sum())
     if not count:
         return []
@@ -260,7 +261,8 @@ def change(result: xr.Dataset, field: str) -> list[str]:
         return [f"P80 does not change from {ends}."]
     error = f" ± {float(ratio.std(ddof=1)) / np.sqrt(count):.2g}" if count > 1 else ""
     told = " (mean ± standard error of pairs)" if error else ""
-    return [f"P80 changes by {float(ratio.mean()):+.3g}{error} % from {ends}{told}."]
+    over = f", on average over {' and '.join(others).replace('_', ' ')}" if others else ""
+    return [f"P80 changes by {float(ratio.mean()):+.3g}{error} % from {ends}{told}{over}."]
 
 
 def lost_cases(result: xr.Dataset) -> list[str]:
