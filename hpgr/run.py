@@ -194,6 +194,7 @@ def _summaries(scene: Scene, bed: LoadedBed) -> dict[str, Any]:
         "peak_pressure_height": heights[highest],
         "streamline_peak_pressure": peaks,
         "streamline_peak_pressure_height": heights,
+        "continuity_solid_fraction": scene.bed.feed_solid_fraction * np.exp(bed.stress.volumetric_strain[:, -1]),
         "shear_limit_fraction": bed.stress.on_shear_limit.mean(),
     }
 

@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+_HEIGHTS = np.linspace(0.0, 1.0, 201)
+
 
 class Geometry(NamedTuple):
     """Outermost streamline X(y) = half_gap + b y**2 + c y**3 and the labels of the computed ones."""
@@ -38,7 +40,7 @@ class Geometry(NamedTuple):
 
     def deviation(self) -> float:
         """Return how far the outermost streamline leaves the roll surface at most, m."""
-        y = np.linspace(0.0, self.height, 201)
+        y = self.height * _HEIGHTS
         return float(np.max(np.abs(self.outer(y) - self.roll_surface(y))))
 
 

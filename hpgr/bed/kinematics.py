@@ -42,15 +42,14 @@ def move(geometry: Geometry, flow: FlowConstants, surface_speed: float, points: 
 
     ValueError if neighbouring points are closer than 1e-9 of the bed's height.
     """
-    y, speed, *rates, across, flux, volumetric, shear = np.zeros((8, geometry.xi.size, points))
-    time_step = 0.0
+    fields = y, speed, *rates, across, flux, volumetric, shear = np.empty((8, geometry.xi.size, points))
     if geometry.height > 0:
         nip = nip_height(geometry, flow)
-        laid = np.empty(points), y, speed, *rates, across, flux, volumetric, shear
-        time_step, closest = kernels.lay(geometry, nip, flow, surface_speed, _panels(geometry, flow, nip), *laid)
+        edges, places = _panels(geometry, flow, nip), np.empty(points)
+        time_step, closest = kernels.lay(geometry, nip, flow, surface_speed, edges, places, *fields)
         _refuse_coinciding(closest / geometry.height, points, flow.entry_fraction)
     else:  # gap = entry gap: no bed to compact; every point is the exit
-        speed += surface_speed
+        fields[:], speed[:], time_step = 0.0, surface_speed, 0.0
     return Kinematics(y, speed, *rates, across, flux, time_step), StepStrains(volumetric, shear)
 
 

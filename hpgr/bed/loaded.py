@@ -99,7 +99,7 @@ def load_bed(inputs: BedInputs) -> LoadedBed:
     bed = LoadedBed(
         walled._replace(xi=xi),
         motion._replace(time_step=every * motion.time_step, **_kept(motion, every)),
-        state._replace(continuity_solid_fraction=state.continuity_solid_fraction[:-1], **_kept(state, every)),
+        state._replace(**_kept(state, every)),
         _press(inputs, walled, motion, strains, state),
         None,
     )

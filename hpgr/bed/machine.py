@@ -146,22 +146,24 @@ def _gap_carrying(inputs: BedInputs, wanted: float) -> float:
 
     force, low, high = _force_at(inputs), math.log(narrow), math.log(wide)
 
-    def excess(share: float) -> float:  # nearly straight in the log of the share; without any force it is far below
-        return math.log(max(force(low + share * (high - low)) / wanted, _NO_FORCE))
+    def excess(log_gap: float) -> float:  # without any force it is far below
+        return math.log(max(force(log_gap) / wanted, _NO_FORCE))
 
-    found = low + _root(excess) * (high - low)
-    if abs(force(found) / wanted - 1) > _PRECISION and force(low) < wanted:  # so narrow that it lies between points
-        tried = [low + share * (high - low) for share in np.linspace(0, 1, _TRIED).tolist()]
-        low, below = max(tried, key=force), "points are too few, or " + below
-        found = low + _root(excess) * (high - low)
-    if abs(force(found) / wanted - 1) > _PRECISION and not force(low) >= wanted >= force(high):
+    def misses(log_gap: float, error: float) -> bool:
+        return not abs(force(log_gap) / wanted - 1) <= error
+
+    found = _root(excess, low, high)
+    if misses(found, _PRECISION) and force(low) < wanted:  # a bed so narrow that it lies between points is not pressed
+        low, below = max(np.linspace(low, high, _TRIED).tolist(), key=force), "points are too few, or " + below
+        found = _root(excess, low, high)
+    if misses(found, _PRECISION) and not force(low) >= wanted >= force(high):
         raise ValueError(
             f"{_refused(wanted)} within the reachable {show(force(high), 'Pa')} (gap {show(wide, 'm')}) to "
             f"{show(force(low), 'Pa')} (gap {show(math.exp(low), 'm')}, below which {below}); choose a force within, "
             "or another bulk modulus (the default is that of loose sand; base = 'industrial' has an ore's), nip angle "
             "or entry gap"
         )
-    if abs(force(found) / wanted - 1) > _CARRIED:
+    if misses(found, _CARRIED):
         jump = [show(force(found + side * _PRECISION), "Pa") for side in (1, -1)]
         raise ValueError(
             f"{_refused(wanted)} outside {jump[0]} to {jump[1]}, between which the force jumps at a gap of "
@@ -179,20 +181,20 @@ def _force_at(inputs: BedInputs) -> Callable[[float], float]:
     return lru_cache(64)(lambda log_gap: _force_over_diameter(inputs._replace(gap=math.exp(log_gap))))
 
 
-def _root(function: Callable[[float], float]) -> float:
-    """Return where from 0 to 1 a function falls past 0, by inverse interpolation in logs; else the end next to it.
+def _root(function: Callable[[float], float], start: float, end: float) -> float:
+    """Return where a function falls past 0, else the end next to it, by inverse interpolation in log(place - start).
 
-    First among places that do not depend on how far it has to fall. Where interpolation leads nowhere or does not
-    gain, as at a jump, to an end not yet seen, then by halves.
+    First at places of a grid, which do not depend on how far it has to fall. Where interpolation leads nowhere or does
+    not gain, as at a jump, to an end not yet seen, then by halves.
     """
-    known: dict[float, float] = {}
+    known: dict[float, float] = {}  # by place, from 0 at the start to 1 at the end
     low, high, guess, last, gains = 0.0, 1.0, 0.5, math.inf, True
     while True:
-        value = known[guess] = function(guess)
+        value = known[guess] = function(start + guess * (end - start))
         low, high = (guess, high) if value > 0 else (low, guess)
         nearest = sorted(known, key=lambda at: abs(known[at]))
         if abs(value) < _PRECISION or high - low < _PRECISION / 10_000:
-            return next(at for at in nearest if at in (low, high))
+            return start + next(at for at in nearest if at in (low, high)) * (end - start)
         gains, last = not gains or len(known) <= _FIRST or abs(value) <= abs(last) / 2, value
         between = _inverse([(known[at], math.log(at)) for at in nearest[:_NEAREST] if at > 0])
         guess = between = math.exp(min(between, 1.0))
@@ -200,7 +202,7 @@ def _root(function: Callable[[float], float]) -> float:
             guess -= math.remainder(between, 1 / (_TRIED - 1))
             guess = guess if low < guess < high else between
         if len(known) == 1 or not gains or not low < guess < high:
-            unseen = [end for end in (low, high) if end not in known and len(known) > 1]
+            unseen = [at for at in (low, high) if at not in known and len(known) > 1]
             guess = unseen[0] if unseen else (low + high) / 2
 
 

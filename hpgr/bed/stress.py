@@ -20,7 +20,6 @@ class StressState(NamedTuple):
     pressure: np.ndarray  # mean stress p, Pa
     shear_stress: np.ndarray  # triaxial, q, Pa
     on_shear_limit: np.ndarray  # of bool, whether shear beyond the convexity limit has been taken as plastic here
-    continuity_solid_fraction: np.ndarray  # (streamline,) that mass continuity would need at the exit; may exceed 1
     tension_clamped: bool  # whether tension, or shear against the flow, was asked for somewhere: stresses are then 0
 
 
@@ -34,4 +33,4 @@ def load(
     # explicit steps from zero strain miss what the state functions say there; they do so for c < 0 only
     tension = zip(lowest, fields[3:5], strict=False) if min(lowest) < 0 else ()
     clamped = lowest[2] < 0 or any(-least > _TENSION_NOISE * stress.max() for least, stress in tension)
-    return StressState(*fields, solid[0] * np.exp(fields[0][:, -1]), clamped)
+    return StressState(*fields, clamped)

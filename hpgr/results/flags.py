@@ -142,7 +142,8 @@ def _no_compaction(run: Run) -> str:
 
 
 def _solid_fraction_capped(run: Run) -> str:
-    phi, most = float(run.bed.stress.continuity_solid_fraction.max()), run.scene.bed.max_solid_fraction
+    bed, strain = run.scene.bed, run.bed.stress.volumetric_strain[:, -1].max()
+    phi, most = bed.feed_solid_fraction * math.exp(strain), bed.max_solid_fraction
     words = f"mass continuity would need a solid fraction of {phi:.3g} at the exit; held at max_solid_fraction {most:g}"
     return words if phi > most else ""
 
