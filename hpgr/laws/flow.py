@@ -123,8 +123,8 @@ class NipFlow(_Profile):
 
     def held(self, gap: float, diameter: float, feed_solid_fraction: float) -> Self:
         """Return the profile with what is held while the gap floats: its nip angle at this gap."""
-        angle = self.angle(gap, diameter, feed_solid_fraction)
-        return self.model_copy(update={"nip_angle": angle, "cake_solid_fraction": None})
+        held = {"nip_angle": self.angle(gap, diameter, feed_solid_fraction), "cake_solid_fraction": None}
+        return self if self.cake_solid_fraction is None else self.model_copy(update=held)
 
     def constants(self, gap: float, diameter: float, feed_solid_fraction: float) -> FlowConstants:
         """Return the profile as the kernels take it."""
