@@ -358,15 +358,16 @@ def _refuse_foreign(path: Path, line: str, overwrite: bool) -> None:
     netcdf.probe(path)
     if overwrite or not path.exists():
         return
-    remedy = "give --out another name, or --overwrite to replace it"
+    option = "--csv" if path.suffix == ".csv" else "--out"
+    remedy = f"give {option} another name, or --overwrite to replace it"
     if not path.stat().st_mode & 0o222:
-        raise ValueError(f"--out: got {path}, which is read-only; {remedy}")
+        raise ValueError(f"{option}: got {path}, which is read-only; {remedy}")
     maker = _maker(path)
     if maker is None:
-        raise ValueError(f"--out: got {path}, which is no whole result of a study; {remedy}")
+        raise ValueError(f"{option}: got {path}, which is no whole result of a study; {remedy}")
     same = _named(maker)[:1] == _named(line)[:1] and (path.suffix != ".nc" or _named(maker) == _named(line))
     if not same:
-        raise ValueError(f"--out: got {path}, which is the result of another command, `{maker}`; {remedy}")
+        raise ValueError(f"{option}: got {path}, which is the result of another command, `{maker}`; {remedy}")
 
 
 def _maker(path: Path) -> str | None:

@@ -158,7 +158,7 @@ def test_further_axes_come_after_the_study_s_own(run):
     assert "±" not in out
 
 
-def test_table_and_csv_agree_with_the_file(run):
+def test_table_and_csv_agree_with_the_file(run, refused):
     code, out, _ = run("--gap", "40 mm", "60 mm", "--sieve", "2 mm", "--no-plot", "--csv", "table")
     assert code == 0
     assert "wrote outputs/gap_sweep.nc and table.csv" in out
@@ -166,6 +166,7 @@ def test_table_and_csv_agree_with_the_file(run):
     shown = dict(zip(heading, zip(*rows, strict=True), strict=True))
     with open("table.csv", encoding="utf-8-sig", newline="") as file:
         plant = list(csv.DictReader(file))
+    assert "--csv: got table.csv, which is no whole result of a study; give --csv" in refused("--csv", "table")
     result = opened("outputs/gap_sweep.nc").astype(float)
     assert [float(gap) for gap in shown["gap [mm]"]] == pytest.approx(1e3 * result["gap"].values)
     assert [float(row["gap [mm]"]) for row in plant] == pytest.approx(1e3 * result["gap"].values)
