@@ -217,7 +217,7 @@ def test_every_input_of_a_bed_changes_it(scene):
     assert beds.load(base) is beds.load(base)
 
 
-FLOATS = ("diameter", "gap", "entry_gap", "speed", "feed_solid_fraction", "max_solid_fraction")
+FLOATS = ("diameter", "gap", "entry_gap", "surface_speed", "feed_solid_fraction", "max_solid_fraction")
 
 
 def same(one, other):

@@ -47,7 +47,12 @@ def move(geometry: Geometry, flow: FlowConstants, surface_speed: float, points: 
         nip = nip_height(geometry, flow)
         edges, places = _panels(geometry, flow, nip), np.empty(points)
         time_step, closest = kernels.lay(geometry, nip, flow, surface_speed, edges, places, *fields)
-        _refuse_coinciding(closest / geometry.height, points, flow.entry_fraction)
+        if not closest >= _CLOSEST * geometry.height:
+            raise ValueError(
+                f"flow.entry_fraction: got {flow.entry_fraction:g} with {points} points and substeps; neighbouring "
+                f"material points would be {closest / geometry.height:.1e} of the bed's height apart, must be at least "
+                f"{_CLOSEST:g}; raise flow.entry_fraction or use fewer points"
+            )
     else:  # gap = entry gap: no bed to compact; every point is the exit
         fields[:], speed[:], time_step = 0.0, surface_speed, 0.0
     return Kinematics(y, speed, *rates, across, flux, time_step), StepStrains(volumetric, shear)
@@ -65,12 +70,3 @@ def _panels(geometry: Geometry, flow: FlowConstants, nip: float) -> np.ndarray:
     # high enough, on the mid-plane, that in the same time no tube begins below the nip, already compacted
     top = max(geometry.height * (1 - flow.entry_fraction), nip * math.hypot(1, geometry.slope(nip)))
     return _TO_NIP * (nip / geometry.height) + _TO_TOP * (top / geometry.height)
-
-
-def _refuse_coinciding(spacing: float, points: int, entry_fraction: float) -> None:
-    if not spacing >= _CLOSEST:
-        raise ValueError(
-            f"flow.entry_fraction: got {entry_fraction:g} with {points} points and substeps; neighbouring material "
-            f"points would be {spacing:.1e} of the bed's height apart, must be at least {_CLOSEST:g}; "
-            "raise flow.entry_fraction or use fewer points"
-        )

@@ -26,7 +26,7 @@ class BedInputs(NamedTuple):
     width: float
     gap: float
     entry_gap: float
-    speed: float
+    surface_speed: float
     flow: Flow
     elasticity: Elasticity
     feed_solid_fraction: float
@@ -55,11 +55,6 @@ class BedInputs(NamedTuple):
         return self.roll_width.mean_pressure(2 * geometry.outer(y), self.width, power)
 
     @property
-    def surface_speed(self) -> float:
-        """Speed of the roll surface, m/s."""
-        return self.speed * self.diameter / 2
-
-    @property
     def stress_points(self) -> int:
         """Points on a streamline at which stress is known, substeps between."""
         return (self.points - 1) * self.elasticity.substeps + 1
@@ -68,7 +63,7 @@ class BedInputs(NamedTuple):
 def inputs_of(scene: Scene, tessellated: bool = False) -> BedInputs:
     """Return what the bed of `scene` depends on."""
     rolls, bed, grid = scene.rolls, scene.bed, scene.resolution
-    machine = rolls.diameter, rolls.width, rolls.gap, rolls.entry_gap, rolls.speed
+    machine = rolls.diameter, rolls.width, rolls.gap, rolls.entry_gap, rolls.surface_speed
     laws = scene.flow, scene.elasticity, bed.feed_solid_fraction, bed.max_solid_fraction, scene.roll_width
     return BedInputs(*machine, *laws, grid.streamlines, grid.points, tessellated)
 
@@ -158,8 +153,6 @@ def _power(inputs: BedInputs, geometry: Geometry, motion: Kinematics, strains: S
 
 
 def _press(inputs: BedInputs, geometry: Geometry, motion: Kinematics, strains: StepStrains, state: StressState):
-    if geometry.height == 0:
-        return Pressed(0.0, 0.0, 0.0)
     first = int((motion.volumetric_rate[-1] > 0).argmax())
     onset = inputs.profile().nip_angle or math.asin(motion.y[-1, first] / geometry.radius)
     force, power = force_on_roll(inputs, geometry, motion, state), _power(inputs, geometry, motion, strains, state)

@@ -73,8 +73,6 @@ def specific_pressing_force(scene: Scene) -> float:
 
 def _force_over_diameter(inputs: BedInputs) -> float:
     roll = inputs.between_rolls(_ROLL)
-    if roll.height == 0:
-        return 0.0
     motion, _, state = bear(inputs, roll)
     return force_on_roll(inputs, roll, motion, state) / inputs.diameter
 
