@@ -360,9 +360,11 @@ def test_a_force_that_jumps_past_what_is_wanted_is_refused():
     """Without a limit of shear (c <= 0) the bed has some as soon as a point compacts."""
     loose = {"elasticity.exponent": 0.0, "resolution.points": 60, "rolls.entry_gap": 2.0}
     scene = paper(loose | {"rolls.specific_pressing_force": 1e5, "flow.exponent": 1.0})
-    words = r"got .*; must lie outside .* between which the force jumps at a gap of .* mm"
-    with pytest.raises(ValueError, match=words):
+    words = r"got .*; must lie outside (.*) MPa to (.*) MPa, between which the force jumps at a gap of .* mm"
+    with pytest.raises(ValueError, match=words) as error:
         machine.float_gap(scene)
+    below, above = map(float, re.search(words, str(error.value)).groups())
+    assert below < 0.1 < above
 
 
 # --- laws of real machines ----------------------------------------------------------------------------------

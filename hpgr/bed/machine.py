@@ -154,9 +154,10 @@ def _gap_carrying(inputs: BedInputs, wanted: float) -> float:
     if misses(found, _PRECISION) and force(low) < wanted:  # a bed so narrow that it lies between points is not pressed
         low, below = max(np.linspace(low, high, _TRIED).tolist(), key=force), "points are too few, or " + below
         found = _root(excess, low, high)
+    refused = f"rolls.specific_pressing_force: got {show(wanted, 'Pa')}; must lie"
     if misses(found, _PRECISION) and not force(low) >= wanted >= force(high):
         raise ValueError(
-            f"{_refused(wanted)} within the reachable {show(force(high), 'Pa')} (gap {show(wide, 'm')}) to "
+            f"{refused} within the reachable {show(force(high), 'Pa')} (gap {show(wide, 'm')}) to "
             f"{show(force(low), 'Pa')} (gap {show(math.exp(low), 'm')}, below which {below}); choose a force within, "
             "or another bulk modulus (the default is that of loose sand; base = 'industrial' has an ore's), nip angle "
             "or entry gap"
@@ -164,7 +165,7 @@ def _gap_carrying(inputs: BedInputs, wanted: float) -> float:
     if misses(found, _CARRIED):
         jump = [show(force(found + side * _PRECISION), "Pa") for side in (1, -1)]
         raise ValueError(
-            f"{_refused(wanted)} outside {jump[0]} to {jump[1]}, between which the force jumps at a gap of "
+            f"{refused} outside {jump[0]} to {jump[1]}, between which the force jumps at a gap of "
             f"{show(math.exp(found), 'm')}; choose a force outside, or elasticity.exponent above 0"
         )
     return math.exp(found)
@@ -194,11 +195,10 @@ def _root(function: Callable[[float], float], start: float, end: float) -> float
         if abs(value) < _PRECISION or high - low < _PRECISION / 10_000:
             return start + next(at for at in nearest if at in (low, high)) * (end - start)
         gains, last = not gains or len(known) <= _FIRST or abs(value) <= abs(last) / 2, value
-        between = _inverse([(known[at], math.log(at)) for at in nearest[:_NEAREST] if at > 0])
-        guess = between = math.exp(min(between, 1.0))
-        if len(known) < _FIRST:
-            guess -= math.remainder(between, 1 / (_TRIED - 1))
-            guess = guess if low < guess < high else between
+        logs = [(known[at], math.log(at)) for at in nearest[:_NEAREST] if at > 0]
+        between = math.exp(min(_inverse(logs), 1.0))
+        on_grid = between - math.remainder(between, 1 / (_TRIED - 1))
+        guess = on_grid if len(known) < _FIRST and low < on_grid < high else between
         if len(known) == 1 or not gains or not low < guess < high:
             unseen = [at for at in (low, high) if at not in known and len(known) > 1]
             guess = unseen[0] if unseen else (low + high) / 2
@@ -206,17 +206,13 @@ def _root(function: Callable[[float], float], start: float, end: float) -> float
 
 def _inverse(known: list[tuple[float, float]]) -> float:
     """Return the place at which the polynomial through values at places is 0, taken as a function of the value."""
-    values, places = [value for value, _ in known], [at for _, at in known]
+    values, places = map(list, zip(*known, strict=True))
     if len(set(values)) < len(values):
         return math.nan
     for span in range(1, len(known)):  # Neville's scheme
         for k, (first, last) in enumerate(zip(values, values[span:], strict=False)):
             places[k] = (first * places[k + 1] - last * places[k]) / (first - last)
-    return places[0] if places else math.nan
-
-
-def _refused(wanted: float) -> str:
-    return f"rolls.specific_pressing_force: got {show(wanted, 'Pa')}; must lie"
+    return places[0]
 
 
 def _narrowest(inputs: BedInputs) -> tuple[float, str]:
