@@ -418,18 +418,22 @@ def _set_bounds(sizes, weakness, slot, bounds, block_bounds, ore):
 
 
 @_inlined
-def _list_candidates(needed, bounds, block_bounds, active, places):
-    """List the blocks whose largest bound reaches what is needed, and the places there whose own does.
-
-    Return the number of both.
-    """
-    actives = candidates = 0
+def _list_blocks(needed, block_bounds, active):
+    """List the blocks whose largest bound reaches what is needed; return their number."""
+    actives = 0
     for block in range(0, block_bounds.size, BLOCK):
         actives = _list_above(needed, block_bounds, block, np.uint32(block), active, actives)
+    return actives
+
+
+@_inlined  # one function of both lists is 4 % of a march slower
+def _list_candidates(needed, bounds, active, actives, places):
+    """List the places in active blocks whose bounds reach what is needed; return their number."""
+    candidates = 0
     for k in range(actives):
         first = active[k] * np.uint32(BLOCK) + np.uint32(1)
         candidates = _list_above(needed, bounds, np.int64(first), first, places, candidates)
-    return actives, candidates
+    return candidates
 
 
 @_inlined
@@ -637,7 +641,8 @@ def crush(parcels, passage, path, ore, work, record):
                     _set_bounds(sizes, weakness, slot, bounds, block_bounds, ore)
                     parcels.bounds_outdated[slot] = False
                 needed = np.float32(critical if critical < 3e38 else 3e38)  # beyond every effective size of float32
-                actives, count = _list_candidates(needed, bounds, block_bounds, active, places)
+                actives = _list_blocks(needed, block_bounds, active)
+                count = _list_candidates(needed, bounds, active, actives, places)
                 _gather(sizes, weakness, slot, places, count, before, own, after, weak)
                 if ore.strength == SIZE_EFFECT:
                     # in whole vectors; what is decided beyond the last candidate is not read
