@@ -59,10 +59,9 @@ def predict(scene: Scene) -> Cost:
         steps = points + grid.snapshots * exchange.interval
         frames += -(-(points - 1) // exchange.interval) if exchange.record_startup else 0
         size += 24 * lines * points * cells + 10_000 * lines * points  # parcels; edges of the tessellation
-        below = (
-            1.0 if solver == "lattice" else 0.1
-        )  # of parcels and steps, squared: the reduced lattice begins far down
-        seconds += 5e-5 * lines * points + below * steps * lines * points * (4e-7 + 3e-9 * cells)
+        # the mean field of the reduced lattice takes as long as 700 cells at each point would
+        of_step = 4e-7 + 3e-9 * cells if solver == "lattice" else 2e-7 + 3e-10 * cells
+        seconds += 5e-5 * lines * points + steps * lines * points * of_step
     if cells and grid.record == "cells":
         size += 4 * frames * lines * points * cells
         seconds += 1e-9 * frames * lines * points * cells
