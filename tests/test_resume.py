@@ -193,18 +193,23 @@ def test_driver_that_waits_says_for_whom_and_takes_over_from_the_silent(base, cl
 
 @pytest.mark.slow
 def test_interrupt_ends_in_one_line_and_the_same_command_goes_on(tmp_path):
-    options = ["--gap", "40 mm", "60 mm", "--replicates", "5000", "--no-plot"]
+    options = ["--gap", "40 mm", "60 mm", "--replicates", "40000", "--no-plot"]
     command = [sys.executable, "-m", "studies.gap_sweep", *options]
     heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # what is started in the background may ignore it
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, preexec_fn=heard) as driver:
         while not list(tmp_path.rglob("*.seg")):
             assert driver.poll() is None
             time.sleep(0.05)
-        driver.send_signal(signal.SIGINT)
-        told = driver.communicate(timeout=100)[1]
+        told, tries = None, 0
+        while told is None:  # one that falls into a callback of the garbage collector is lost: a user tries again
+            driver.send_signal(signal.SIGINT)
+            tries += 1
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                told = driver.communicate(timeout=20)[1]
     assert driver.returncode == 130, told
     said = [line for line in told.splitlines() if line and "cases" not in line.split("; ")[0]]
-    assert said == ["interrupted; a sweep's finished cases are kept, and the same command goes on from there"]
+    assert said[-1] == "interrupted; a sweep's finished cases are kept, and the same command goes on from there"
+    assert len(said) == 1 or tries > 1  # a lost one is told by Python
     assert list(tmp_path.rglob("*.seg"))
     assert not list(tmp_path.rglob(".hpgr-*"))
 
