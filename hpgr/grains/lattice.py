@@ -155,13 +155,14 @@ class Lattice:
         self._scene, self._rates, self._steady, self._each = scene, rates, steady, cores.each
         self._seed, self._replicate = seed, replicate
         self._path, self._ore = march.path(scene, log_stress), march.ore(scene)
-        self._breaking = can_break(scene, self._path).ravel()
+        self._breaking = np.flatnonzero(can_break(scene, self._path))
         cells, scattered = scene.resolution.cells, math.isfinite(scene.strength.scatter)
         self.parcels = kernels.make_parcels(log_stress.size, cells, scattered)
         self._shares = kernels.make_shares(log_stress.size, cells, _SHARE, scattered)
         self._per_size = np.float32(2.0**30 / scene.feed.largest_grain)  # parts in which sizes are summed, to 3e-8
         self._works = [kernels.make_work(cells) for _ in range(cores.count)]
         self._home = np.arange(log_stress.size).reshape(log_stress.shape)
+        self._lines, self._points = np.divmod(self._home.ravel(), log_stress.shape[1])
         self.slots = self._home
         self._entering = entering
         self.swaps, self.most_substeps = 0, 0
@@ -172,9 +173,8 @@ class Lattice:
         """Take time step `step`: at 0 fill the machine, later shift all parcels and let feed in; crush; swap."""
         self.slots = np.roll(self._home, step, axis=1)
         self._let_in(step)
-        lines, points = np.divmod(np.arange(self.slots.size), self.slots.shape[1])
-        slots, lines, points = (part[self._breaking] for part in (self.slots.ravel(), lines, points))
-        self._crush(slots, lines, points, points + 1)
+        at = self._points[self._breaking]
+        self._crush(self._breaking, at, at + 1)
         self._swap(step)
 
     def keep(self, slots: np.ndarray, sizes: np.ndarray) -> np.ndarray:
@@ -192,12 +192,13 @@ class Lattice:
             kernels.classify(self.parcels.sizes, slot, sieves, place, counts)
         return counts.reshape(*self.slots.shape, -1)
 
-    def _crush(self, slots: np.ndarray, lines: np.ndarray, first: np.ndarray, last: np.ndarray) -> None:
-        """Crush parcels at their points from `first` to before `last`, shared between the cores."""
-        parts = np.array_split(np.arange(slots.size), len(self._works))
+    def _crush(self, places: np.ndarray, first: np.ndarray, last: np.ndarray) -> None:
+        """Crush the parcels at these places at points from `first` to before `last`, shared between the cores."""
+        passages = self.slots.ravel()[places], self._lines[places], first, last
+        parts = np.array_split(np.arange(places.size), len(self._works))
 
         def crush(work, part):
-            passage = Passage(*(np.ascontiguousarray(each[part]) for each in (slots, lines, first, last)))
+            passage = Passage(*(each[part] for each in passages))
             kernels.gather(self._shares, passage.slots, self.parcels)
             kernels.crush(self.parcels, passage, self._path, self._ore, work, Record())
             kernels.spread(self.parcels, passage.slots, self._shares, self._per_size)
@@ -214,8 +215,7 @@ class Lattice:
             march.fill(self.parcels, part.ravel(), self._scene, bases, self._entering)
         kernels.spread(self.parcels, slots.ravel(), self._shares, self._per_size)
         if step == 0 and self._scene.exchange.start == "crushed":
-            lines, points = np.divmod(np.arange(self.slots.size), self.slots.shape[1])
-            self._crush(self.slots.ravel(), lines, 0 * points, points)
+            self._crush(self._home.ravel(), 0 * self._points, self._points)
 
     def _bases(self, entered: int) -> np.ndarray:
         """Return the bases of the streams of what entered all streamlines at a step, which may lie before the first."""
