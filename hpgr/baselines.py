@@ -31,8 +31,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import optimize
 
-from hpgr.calibration import PARTS as PRODUCTS
-from hpgr.calibration import measured
+from hpgr.calibration import PARTS, measured
 from hpgr.laws.flow import cake_nip_angle, densest_ratio
 from hpgr.scene import Scene
 from hpgr.tables import PilotTest
@@ -370,7 +369,7 @@ def _least_squares(model, tests, kind) -> Fit:
         """Return model minus measurement in percent passing wherever there is one."""
         found = parameters(vector)
         pairs = [(model.predict(found, test), test) for test in tests]
-        off = np.hstack([100 * (getattr(one, name) - getattr(test, name)) for one, test in pairs for name in PRODUCTS])
+        off = np.hstack([100 * (getattr(one, name) - getattr(test, name)) for one, test in pairs for name in PARTS])
         return off[~np.isnan(off)]
 
     ends = (place_of(low), place_of(high))

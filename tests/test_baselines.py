@@ -35,7 +35,7 @@ def pilot():
 def made_up(name="A", speed=0.7, force=3e6, **measured):
     """Return a test without any measured product."""
     values = dict.fromkeys(tables.PilotTest._fields[3:], math.nan)
-    values |= dict.fromkeys(baselines.PRODUCTS, np.full(len(SIZES), math.nan))
+    values |= dict.fromkeys(baselines.PARTS, np.full(len(SIZES), math.nan))
     values |= {"gap": 0.018, "cake_thickness": 0.022, "hydraulic_pressure": 2 * force, "sizes": SIZES, "feed": FEED}
     return tables.PilotTest(name, speed, force, **(values | measured))
 
@@ -56,7 +56,7 @@ def scene():
 
 
 def as_measured(test, prediction):
-    return test._replace(**{name: getattr(prediction, name) for name in baselines.PRODUCTS})
+    return test._replace(**{name: getattr(prediction, name) for name in baselines.PARTS})
 
 
 # ---------------------------------------------------------------------------- Torres & Casali, worked case
@@ -214,7 +214,7 @@ def test_predictions_are_distributions_with_the_centre_finest(pilot):
     fit = torres_casali(reference=0.0376, force="specific_pressing_force")
     for test in pilot:
         found = fit.predict(test)
-        for name in baselines.PRODUCTS:
+        for name in baselines.PARTS:
             passing = getattr(found, name)
             assert (np.diff(passing) >= -1e-12).all()
             assert passing[-1] == pytest.approx(1.0)
@@ -274,7 +274,7 @@ def test_edge_and_centre_share_the_energy():
 
 def rmse(prediction, test):
     """Root mean square error, percent passing, of centre, edge and total; NaN where not measured."""
-    errors = {name: 100 * (getattr(prediction, name) - getattr(test, name)) for name in baselines.PRODUCTS}
+    errors = {name: 100 * (getattr(prediction, name) - getattr(test, name)) for name in baselines.PARTS}
     return {
         name: float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else math.nan
         for name, error in errors.items()
