@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from hpgr import __version__, cost
-from hpgr.bed import machine
+from hpgr.bed import machine, stress
 from hpgr.bed.loaded import Beds, LoadedBed, inputs_of
 from hpgr.fields import check_number
 from hpgr.grains import solve
@@ -194,7 +194,7 @@ def _summaries(scene: Scene, bed: LoadedBed) -> dict[str, Any]:
         "peak_pressure_height": heights[highest],
         "streamline_peak_pressure": peaks,
         "streamline_peak_pressure_height": heights,
-        "continuity_solid_fraction": scene.bed.feed_solid_fraction * np.exp(bed.stress.volumetric_strain[:, -1]),
+        "continuity_solid_fraction": stress.continuity_solid_fraction(bed.stress, scene.bed.feed_solid_fraction),
         "shear_limit_fraction": bed.stress.on_shear_limit.mean(),
     }
 

@@ -23,6 +23,11 @@ class StressState(NamedTuple):
     tension_clamped: bool  # whether tension, or shear against the flow, was asked for somewhere: stresses are then 0
 
 
+def continuity_solid_fraction(state: StressState, feed_solid_fraction: float) -> np.ndarray:
+    """Return the solid fraction (streamline,) that mass continuity would need at the exit; it may exceed 1."""
+    return feed_solid_fraction * np.exp(state.volumetric_strain[:, -1])
+
+
 def load(
     elastic: ElasticConstants, solid: tuple[float, float], kinematics: Kinematics, strains: StepStrains
 ) -> StressState:

@@ -9,6 +9,7 @@ import numpy as np
 
 from hpgr.bed.loaded import LoadedBed
 from hpgr.bed.machine import Performance
+from hpgr.bed.stress import continuity_solid_fraction
 from hpgr.fields import show, unit_shown
 from hpgr.grains.solve import Crushed, crushing_stress
 from hpgr.laws.fragments import HELD
@@ -142,8 +143,8 @@ def _no_compaction(run: Run) -> str:
 
 
 def _solid_fraction_capped(run: Run) -> str:
-    bed, strain = run.scene.bed, run.bed.stress.volumetric_strain[:, -1].max()
-    phi, most = bed.feed_solid_fraction * math.exp(strain), bed.max_solid_fraction
+    bed = run.scene.bed
+    phi, most = continuity_solid_fraction(run.bed.stress, bed.feed_solid_fraction).max(), bed.max_solid_fraction
     words = f"mass continuity would need a solid fraction of {phi:.3g} at the exit; held at max_solid_fraction {most:g}"
     return words if phi > most else ""
 
