@@ -12,6 +12,16 @@ _HOMES = {"open_cases": "sweep.assemble", "optimise": "optimum", "close_circuit"
 __all__ = sorted(_HOMES)
 
 
+class Late:
+    """A module that is loaded when something of it is first asked for, after the command line is read."""
+
+    def __init__(self, name: str):
+        self._module = name
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(import_module(self._module), name)
+
+
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'studies' has no attribute {name!r}")

@@ -6,6 +6,8 @@ value of their quantity; percent below 1 mm by at least 1 %, and a reference of 
 little or nothing breaks has errors too.
 """
 
+import os
+import platform
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,11 +18,14 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import numpy as np
 
 from hpgr.scene import Scene, levels
+from studies import Late
 from studies import command as cli
 from studies.convergence import ROUNDING, jackknife, pareto, richardson
 
 if TYPE_CHECKING:
     import xarray as xr
+
+cost, run, schema = Late("hpgr.cost"), Late("hpgr.run"), Late("hpgr.results.schema")
 
 _SIEVE = 1e-3  # m, of the percent below 1 mm
 _LEAST_PERCENT = 1.0  # that errors of the percent below 1 mm are divided by
@@ -107,9 +112,6 @@ def study(scene: Scene, plan: Plan, seed: int = 0, progress: bool = False) -> "x
 
     ValueError if the scene has no cells, a single one, or exchange; or there are fewer than 2 replicates.
     """
-    from hpgr import run
-    from hpgr.results import schema
-
     _refuse(scene, plan)
     scene = scene.with_values({"resolution.record": "product", "resolution.sieves": [_SIEVE]})
     ladders, found = _ladders(scene, plan), {}
@@ -216,8 +218,6 @@ def _climb(ladder: Ladder, seed: int, bar: Any) -> tuple[np.ndarray, np.ndarray]
 
 def _run(scene: Scene, seed: int, replicate: int) -> tuple[list[float], float]:
     """Return the quantities of one run, unrounded by a Dataset, and its wall time in s."""
-    from hpgr import cost, run
-
     cost.refuse_too_large(scene)
     begun = time.perf_counter()
     values = run.run_scene(scene, seed, replicate).values
@@ -228,16 +228,14 @@ def _run(scene: Scene, seed: int, replicate: int) -> tuple[list[float], float]:
 
 def _variables(name: str, ladder: Ladder, values: np.ndarray, seconds: np.ndarray) -> dict[str, tuple]:
     """Return table entry and values of samples, wall time, bias and noise of a ladder, and of its axes."""
-    from hpgr.results.schema import VARIABLES, Variable
-
-    entry = partial(Variable, dtype=None)
+    entry = partial(schema.Variable, dtype=None)
     dims, shape = tuple(ladder.axes), tuple(map(len, ladder.axes.values()))
     replicate = "few_replicates" if name in ("solver", "reference") else "replicate"
     found: dict[str, tuple] = {}
     for axis, rungs in ladder.axes.items():
         found[axis] = entry((axis,), "" if isinstance(rungs[0], str) else "1", axis.replace("_", " ")), rungs
     for k, (quantity, (variable, shown)) in enumerate(QUANTITIES.items()):
-        unit = "percent" if quantity == "below_1mm" else VARIABLES[variable].units
+        unit = "percent" if quantity == "below_1mm" else schema.VARIABLES[variable].units
         own = entry((*dims, replicate), unit, f"{shown}, over {name}")
         found[f"{name}_{quantity}"] = own, values[..., k].reshape(*shape, -1)
     errors = []
@@ -264,9 +262,7 @@ def _scales(values: np.ndarray) -> np.ndarray:
 
 def _front(plan: Plan, found: dict[str, tuple]) -> dict[str, tuple]:
     """Return the work-precision grid: streamlines, points, cells and level, errors, and the Pareto front."""
-    from hpgr.results.schema import Variable
-
-    entry, rows = partial(Variable, ("combination",), "1", dtype=None), combinations(plan)
+    entry, rows = partial(schema.Variable, ("combination",), "1", dtype=None), combinations(plan)
     names, axes = {_grid_of(name): name for name in plan.levels}, ("streamlines", "points", "cells")
     error = np.abs(found["combination_bias"][1]) + 2 * found["combination_noise"][1]
     worst = error[:, :SAMPLED].max(axis=1)
@@ -274,7 +270,7 @@ def _front(plan: Plan, found: dict[str, tuple]) -> dict[str, tuple]:
     words = "largest error of P50, P80 and percent below 1 mm: |bias| + 2 standard errors, relative"
     return {
         **{f"combination_{axis}": (entry(axis), column) for axis, column in zip(axes, np.array(rows).T, strict=True)},
-        "quantity": (Variable(("quantity",), "", "quantity an error is of", dtype=None), list(QUANTITIES)),
+        "quantity": (schema.Variable(("quantity",), "", "quantity an error is of", dtype=None), list(QUANTITIES)),
         "combination_level": (entry("named level, if any")._replace(units=""), [names.get(row, "") for row in rows]),
         "combination_worst_error": (entry(words), worst),
         "combination_on_front": (entry("whether no other is as cheap and as accurate"), front),
@@ -282,11 +278,6 @@ def _front(plan: Plan, found: dict[str, tuple]) -> dict[str, tuple]:
 
 
 def _attributes(scene: Scene, plan: Plan, seed: int) -> dict[str, Any]:
-    import os
-    import platform
-
-    from hpgr.results import schema
-
     return schema.dataset_attributes(
         "Accuracy against cost of comminution in high pressure grinding rolls",
         scene=scene.model_dump_json(),

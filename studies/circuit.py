@@ -16,12 +16,16 @@ from pydantic import ValidationError
 from hpgr.fields import Frozen, Metres, Number, check_number, faults_of, quantity, show
 from hpgr.laws.feed import TableFeed
 from hpgr.scene import Scene, check_scene
+from studies import Late
 from studies import command as line
 from studies.command import Report, shown_as
 from studies.sweep.space import Case, CaseResult, Space, SweepSpec, axes_of
 
 if TYPE_CHECKING:
     import xarray as xr
+
+loaded, run, schema = Late("hpgr.bed.loaded"), Late("hpgr.run"), Late("hpgr.results.schema")
+report, assemble = Late("studies.show.report"), Late("studies.sweep.assemble")
 
 _SIEVES = np.round(10 ** (np.arange(241) / 40 - 6), 12)  # m, 40 a decade: between them distributions are log-linear
 _SIZES = np.sqrt(_SIEVES * np.append(_SIEVES[0] / 10, _SIEVES[:-1]))  # of the classes below them
@@ -101,17 +105,14 @@ def steady(scene: Scene, returned: Screen | EdgeRecycle, seed: int = 0, replicat
 
     ValueError if the recycle grows without end, or does not settle.
     """
-    from hpgr.bed.loaded import Beds
-    from hpgr.run import run_scene
-
     scene = scene.with_values({"resolution.sieves": _SIEVES.tolist(), "resolution.record": "product"})
     if scene.resolution.cells == 0:
         raise ValueError("resolution.cells: got 0; a circuit needs the product; give cells")
-    fresh, beds = _classes(scene.feed.passing(_SIEVES)), Beds(1)
+    fresh, beds = _classes(scene.feed.passing(_SIEVES)), loaded.Beds(1)
     inputs, outputs = [np.zeros(_SIEVES.size)], []
     for iteration in range(1, _MOST_ITERATIONS + 1):
         feed = fresh + inputs[-1]
-        result = run_scene(scene.with_values({"feed": _table(feed)}), seed, replicate, beds)
+        result = run.run_scene(scene.with_values({"feed": _table(feed)}), seed, replicate, beds)
         back, product = returned.split(scene, result.values)
         outputs.append(back * feed.sum())
         residual = float(np.abs(outputs[-1] - inputs[-1]).sum())
@@ -197,8 +198,6 @@ def close_circuit(
     >>> bool(low > high > 0)
     True
     """
-    from studies.sweep.assemble import assemble
-
     check_scene(scene)
     check_number("replicates", replicates)
     check_number("seed", seed)
@@ -209,7 +208,7 @@ def close_circuit(
     results = [_case(spec, returned, case) for case in space.cases()]
     if not any(one.summary for one in results):
         raise ValueError(results[0].message)
-    return assemble(spec, space, results, _variables()).assign_attrs(returned=repr(returned))
+    return assemble.assemble(spec, space, results, _variables()).assign_attrs(returned=repr(returned))
 
 
 def _case(spec: SweepSpec, returned: Screen | EdgeRecycle, case: Case) -> CaseResult:
@@ -243,10 +242,8 @@ def _figures(found: Closed) -> dict[str, Any]:
 
 def _variables() -> dict[str, Any]:
     """Return what a circuit's Dataset has: the rolls' variables, and its own."""
-    from hpgr.results.schema import COORDINATES, VARIABLES, Variable
-
-    per, sieve = "per unit of fresh feed", ("sieve",)
-    rolls = {name: entry for name, entry in VARIABLES.items() if not {"point", "cell", "time"} & set(entry.dims)}
+    Variable, per, sieve = schema.Variable, "per unit of fresh feed", ("sieve",)
+    rolls = {name: entry for name, entry in schema.VARIABLES.items() if not {"point", "cell", "time"} & set(entry.dims)}
     own = {
         "circulating_load": Variable((), "1", "circulating load", "recycle over fresh feed"),
         "fresh_feed": Variable((), "kg s-1", "fresh feed", "and product of the circuit"),
@@ -259,7 +256,7 @@ def _variables() -> dict[str, Any]:
         "recycle_passing": Variable(sieve, "1", "mass fraction passing", "what goes back"),
         "product_passing": Variable(sieve, "1", "mass fraction passing", "product of the circuit"),
     }
-    return {name: COORDINATES[name] for name in ("xi", "sieve")} | rolls | own
+    return {name: schema.COORDINATES[name] for name in ("xi", "sieve")} | rolls | own
 
 
 _SHOWN = {
@@ -275,8 +272,6 @@ _SHOWN = {
 
 def table(result: "xr.Dataset") -> str:
     """Return a line for each operating point."""
-    from studies.show import report
-
     points = report.operating_points(result)
     found = {heading: points[name].astype(float) * factor for name, (heading, factor) in _SHOWN.items()}
     return report.points_table(result, points, found)
@@ -312,7 +307,6 @@ def main(options: Options) -> Report:
     returned = EdgeRecycle() if options.edge_recycle else Screen(**screen)
     space = line.all_varied(list, options.vary)
     result = close_circuit(line.base_scene(options), returned, space, options.replicates, options.seed)
-    from studies.show import report
     from studies.show.plots.circuit import circuit_figure
 
     lines = [table(result), *report.flagged(result)]

@@ -18,10 +18,13 @@ from pydantic import ValidationError
 from hpgr import presets
 from hpgr.fields import check_number, faults_of, parse
 from hpgr.scene import Scene, field_info, levels
+from studies import Late
 from studies.sweep.space import ends_of, field_of
 
 if TYPE_CHECKING:
     import matplotlib.figure
+
+metrics, netcdf = Late("hpgr.results.metrics"), Late("studies.sweep.netcdf")
 
 # A study's files name the command that made them: in the history, a PNG's "Source", a GIF's comment, a page's
 # generator, the first line of a scene file
@@ -128,17 +131,12 @@ def _named_scene(name: str) -> Scene:
             f"--scene: got {name!r}; must be a preset ({', '.join(presets.NAMES)}) or a .toml, .json or .nc file"
         )
     try:
-        return _scene_of_study(Path(name)) if Path(name).suffix == ".nc" else Scene.from_file(name)
+        if Path(name).suffix != ".nc":
+            return Scene.from_file(name)
+        with netcdf.open_result(name) as dataset:
+            return metrics.scene_of(dataset)
     except OSError as error:
         raise ValueError(f"--scene: cannot read {name!r}: {error.strerror}") from None
-
-
-def _scene_of_study(path: Path) -> Scene:
-    from hpgr.results.metrics import scene_of
-    from studies.sweep.netcdf import open_result
-
-    with open_result(path) as dataset:
-        return scene_of(dataset)
 
 
 def quantity_of(option: str, text: str, unit: str) -> float:
@@ -199,9 +197,7 @@ def all_varied(kind: type, texts: Sequence[str]) -> dict[str, Any]:
 
 def posterior(path: Path) -> dict[str, list[float]]:
     """Return samples of scene fields of a calibration's file, such as outputs/pilot.nc: variables along `sample`."""
-    from studies.sweep.netcdf import open_result
-
-    with open_result(path) as dataset:
+    with netcdf.open_result(path) as dataset:
         found = {name: value.values.tolist() for name, value in dataset.data_vars.items() if value.dims == ("sample",)}
     if not found:
         raise ValueError(f"{path}: has no samples of scene fields along 'sample'; give the file of a studies.pilot")
@@ -331,8 +327,6 @@ def print_plainly(*lines: str, file: Any = None) -> None:
 
 
 def _write(part: Part, path: Path, line: str) -> str:
-    from studies.sweep import netcdf
-
     if callable(part):
         netcdf.replace(path, lambda temporary: part(temporary, line))
     else:
@@ -353,8 +347,6 @@ def _refuse_foreign(path: Path, line: str, overwrite: bool) -> None:
     OSError, ValueError
         Naming the file, what it holds, and the remedy.
     """
-    from studies.sweep import netcdf
-
     netcdf.probe(path)
     if overwrite or not path.exists():
         return
@@ -372,8 +364,6 @@ def _refuse_foreign(path: Path, line: str, overwrite: bool) -> None:
 
 def _maker(path: Path) -> str | None:
     """Return the command line that made a file, of a picture or page its beginning; None if it is no study's."""
-    from studies.sweep import netcdf
-
     if path.suffix != ".nc":
         with path.open("rb") as file:
             found = _MARK.search(file.read(_MARK_WITHIN))

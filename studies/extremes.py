@@ -12,14 +12,18 @@ from itertools import combinations, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
+import numpy as np
 from pydantic import ValidationError
 
+from studies import Late
 from studies import command as cli
 from studies.guard import maps, ranges
 from studies.guard.judge import KINDS, Outcome, as_wanted, base, catalogue, hosts, judge
 
 if TYPE_CHECKING:
     import xarray as xr
+
+cost, flags, schema = Late("hpgr.cost"), Late("hpgr.results.flags"), Late("hpgr.results.schema")
 
 PARTS = ("catalogue", "ends", "outside", "pairs", "random")
 _PAIR_SECONDS = 0.05  # predicted cost from which the upper end of a field takes no part in pairs
@@ -97,8 +101,6 @@ def walk(scenes: int, seed: int = 0, every: int = 1, progress: bool = False) -> 
 
 def random_values(number: int, seed: int = 0) -> dict[str, Any]:
     """Return the values of a random scene; every fourth has exchange."""
-    import numpy as np
-
     return ranges.draw(base(), np.random.default_rng([seed, number]), number % 4 == 3, _RANDOM_SECONDS)
 
 
@@ -116,18 +118,14 @@ def _pairs(known: Mapping[str, ranges.Range]) -> Iterator[tuple[str, dict[str, A
 
 
 def _cheap(values: dict[str, Any]) -> bool:
-    from hpgr.cost import predict
-
     try:
-        return predict(base(hosts(values)[0])).seconds < _PAIR_SECONDS
+        return cost.predict(base(hosts(values)[0])).seconds < _PAIR_SECONDS
     except ValidationError:
         return True  # refused alone, and at no cost
 
 
 def dataset(walked: Sequence[Walked], mapped: "xr.Dataset", seed: int = 0) -> "xr.Dataset":
     """Return every scene of the walk along `scene`, beside the maps."""
-    from hpgr.results import schema
-
     values, own = maps.outcome_variables("", ("scene",), [each.outcome for each in walked], (len(walked),))
     texts = {
         "part": ("part of the walk", [each.part for each in walked]),
@@ -149,7 +147,6 @@ def faulty(walked: Sequence[Walked]) -> list[str]:
 
 def table(result: "xr.Dataset") -> str:
     """Return the counts of outcomes per part, and what refused and flagged the scenes, as text."""
-    from hpgr.results import flags
     from studies.show.report import aligned
 
     kinds, parts, bits = (result[name].values for name in ("outcome", "part", "flags"))

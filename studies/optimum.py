@@ -18,6 +18,7 @@ import numpy as np
 
 from hpgr.fields import check_number, show, values_of
 from hpgr.scene import Scene, check_scene, field_info
+from studies import Late
 from studies import command as line
 from studies.command import Report, shown_as
 from studies.quantities import Quantity, quantity_of, refuse_lost, with_sieves
@@ -25,6 +26,8 @@ from studies.sweep.space import between, ends_of, sobol_points
 
 if TYPE_CHECKING:
     import xarray as xr
+
+loaded, run, solve = Late("hpgr.bed.loaded"), Late("hpgr.run"), Late("hpgr.grains.solve")
 
 _POINTS = 64  # of the design, for one field or two; twice as many for each field more
 _REPLICATES = 4  # of a scene that breaks at random: their mean is optimised
@@ -163,15 +166,12 @@ class _Search:
     """A search in the unit cube of the ranges; figures, the objective first, are means and are kept."""
 
     def __init__(self, scene: Scene, ends: dict, objective: Quantity, limits: list[Limit], sign: int, seed: int):
-        from hpgr.bed.loaded import Beds
-        from hpgr.grains import solve
-
         self.ends, self.limits, self.sign, self.seed = ends, limits, sign, seed
         self.asked = list(dict.fromkeys([objective, *(limit.quantity for limit in limits)]))
         fineness = next((one for one in self.asked if one.of_product), quantity_of("p80"))
         self.traded = [fineness, quantity_of("specific energy"), quantity_of("throughput")]
         self.every = list(dict.fromkeys([*self.asked, *self.traded]))
-        self.own, self.scene, self.beds = scene, with_sieves(scene, self.every), Beds(4)
+        self.own, self.scene, self.beds = scene, with_sieves(scene, self.every), loaded.Beds(4)
         drawn = solve.choose(self.scene) not in ("stress only", "closed form")
         random = drawn and any(one.of_product for one in self.asked)
         self.replicates, self.judges = (_REPLICATES, _JUDGES) if random else (1, 1)
@@ -188,11 +188,9 @@ class _Search:
 
     def run(self, unit: np.ndarray, replicates: range) -> np.ndarray:
         """Return the figures (figure, replicate) at a point; NaN if its scene is refused."""
-        from hpgr.run import run_scene
-
         try:
             scene = self.scene.with_values(self.values(unit))
-            runs = [run_scene(scene, self.seed, replicate, self.beds).values for replicate in replicates]
+            runs = [run.run_scene(scene, self.seed, replicate, self.beds).values for replicate in replicates]
         except ValueError:
             return np.full((len(self.every), len(replicates)), np.nan)
         return np.array([[one.of(values) for values in runs] for one in self.every], float)

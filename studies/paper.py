@@ -6,6 +6,7 @@ scene has a pressing force, all is drawn at the gap that carries it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,10 +14,13 @@ import numpy as np
 
 from hpgr.fields import values_of
 from hpgr.scene import Scene
+from studies import Late
 from studies import command as cli
 
 if TYPE_CHECKING:
     import xarray as xr
+
+loaded, run, schema = Late("hpgr.bed.loaded"), Late("hpgr.run"), Late("hpgr.results.schema")
 
 FIGURES = ("paper_figure3.png", "paper_figure4.png", "paper_figure5.png")
 ANIMATION = "paper_startup.gif"
@@ -87,9 +91,6 @@ def study(
     >>> dict(result["pressure"].sizes)
     {'streamline': 9, 'point': 50}
     """
-    from hpgr import run
-    from hpgr.results import schema
-
     _refuse(scene, shown_points)
     floated = run.load(scene)[0]
     # everything is drawn at this gap, also what has another number of points, or another law
@@ -112,12 +113,8 @@ def study(
 
 def _own() -> dict[str, Any]:
     """Return the table of the study's own variables."""
-    from functools import partial
-
-    from hpgr.results.schema import Variable
-
     place, product = ("shown_streamline", "shown_point"), ("product_streamline",)
-    whole = partial(Variable, dtype=None)
+    whole = partial(schema.Variable, dtype=None)
     point, corner, variant = partial(whole, place), partial(whole, ("corner",)), partial(whole, ("variant",))
     frame, left = partial(whole, ("snapshot",)), "negative on the left"
     return {
@@ -135,9 +132,9 @@ def _own() -> dict[str, Any]:
         "corner_x": corner("m", "distance of the corner from the mid-plane", "of a Voronoi cell, right half"),
         "corner_height": corner("m", "height of the corner", "of a Voronoi cell"),
         "product_xi": whole(product, "1", "position of the stream tube", "over half the gap"),
-        "passing": Variable((*product, "sieve"), "1", "mass fraction passing", "product of the stream tube"),
-        "p50": Variable(product, "m", "product P50"),
-        "p80": Variable(product, "m", "product P80"),
+        "passing": schema.Variable((*product, "sieve"), "1", "mass fraction passing", "product of the stream tube"),
+        "p50": schema.Variable(product, "m", "product P50"),
+        "p80": schema.Variable(product, "m", "product P80"),
         "feed_passing": whole(("sieve",), "1", "mass fraction of the feed passing"),
         "snapshot": frame("1", "snapshot number", "of the start-up"),
         "elapsed_time": frame("s", "time since the machine was filled"),
@@ -179,9 +176,8 @@ def _across(values, odd: bool = False) -> np.ndarray:
 def _fields(scene: Scene) -> dict[str, Any]:
     """Return figures 3a, 3b and 4: everything that needs no grains, on the stream tubes' centres, mid-plane and rim."""
     from hpgr.bed import geometry, kinematics, stress
-    from hpgr.bed.loaded import inputs_of
 
-    inputs, substeps = inputs_of(scene), scene.elasticity.substeps
+    inputs, substeps = loaded.inputs_of(scene), scene.elasticity.substeps
     xi = np.array([0.0, *geometry.centres(inputs.streamlines), 1.0])
     bed = inputs.between_rolls(xi)
     flow, *solid = inputs.laws()
@@ -203,9 +199,7 @@ def _fields(scene: Scene) -> dict[str, Any]:
 
 def _shown(shown: Scene) -> dict[str, Any]:
     """Return figures 3c and 3d: few material points, their volumes, and the outlines of the right half's."""
-    from hpgr.bed.loaded import inputs_of, load_bed
-
-    bed = load_bed(inputs_of(shown, tessellated=True))
+    bed = loaded.load_bed(loaded.inputs_of(shown, tessellated=True))
     motion, cells = bed.kinematics, bed.tessellation
     # the concave rim may cut a cell in two: outlines are of pieces
     parts = enumerate(getattr(cell, "geoms", [cell]) for cell in cells.cells)
@@ -226,8 +220,6 @@ def _shown(shown: Scene) -> dict[str, Any]:
 
 def _product(scene: Scene, seed: int) -> tuple[dict[str, Any], dict[str, str]]:
     """Return figure 5, the product of every stream tube from mid-plane to roll and the feed, and what is told of it."""
-    from hpgr import run
-
     found = run.run_scene(scene.with_values({"resolution.record": "product", "resolution.sieves": _SIEVES}), seed)
     values = {name: found.values[name] for name in ("passing", "p50", "p80", "sieve")}
     values |= {"product_xi": found.values["xi"], "feed_passing": scene.feed.passing(_SIEVES)}
@@ -236,8 +228,6 @@ def _product(scene: Scene, seed: int) -> tuple[dict[str, Any], dict[str, str]]:
 
 def _startup(shown: Scene, seed: int) -> dict[str, Any]:
     """Return P80 of the shown points while the machine, filled with feed, turns until it is steady."""
-    from hpgr import run
-
     changed = {
         "resolution.cells": min(shown.resolution.cells, _STARTUP_CELLS),
         "resolution.record": "cells",
@@ -284,8 +274,6 @@ def variants(scene: Scene) -> dict[str, Scene]:
 
 def _assumptions(scene: Scene, seed: int) -> dict[str, Any]:
     """Return peak pressure and P80 at mid-gap and at the roll, with one assumption changed at a time."""
-    from hpgr import run
-
     scenes = variants(scene)
     runs = [run.run_scene(other, seed).values for other in scenes.values()]
     found: dict[str, Any] = {"assumption": list(scenes)}

@@ -16,11 +16,15 @@ import numpy as np
 
 from hpgr import presets
 from hpgr.fields import values_of
-from hpgr.scene import Scene
+from hpgr.scene import Scene, field_info
+from studies import Late
 from studies.command import Flag, Out, Overwrite, Plot, Report, SceneName, base_scene, command, figure, shown_as
 
 if TYPE_CHECKING:
     import xarray as xr
+
+calibration, schema, report = Late("hpgr.calibration"), Late("hpgr.results.schema"), Late("studies.show.report")
+models_of = Late("hpgr.baselines")
 
 PARTS = ("centre", "edge", "total")
 FIGURES = ("throughput", "power", "specific_energy")
@@ -170,9 +174,6 @@ def _models(
     scene: Scene, known: Sequence[Any], fit: Any, baselines: bool
 ) -> tuple[list[Model], Scene, dict[str, np.ndarray]]:
     """Return the fitted models, ours first, its scene, with the sieves of `scene`, and samples of its fields."""
-    from hpgr import calibration
-    from hpgr.baselines import MODELS
-
     print(f"fitting to {', '.join(test.name for test in known)} (under a minute)", flush=True)
     found = calibration.fit_tests(scene, known, fit)
     found = calibration.validated(found) if len(known) > 2 else found
@@ -181,7 +182,7 @@ def _models(
     drawn = [values_of(one) for one in found.sample(_SAMPLES, seed=0)]
     samples = {name: np.array([one[name] for one in drawn]) for name in fields}
     models = [Model("hpgr", found.predict, str(found))]
-    for name, fit_model in (MODELS if baselines else {}).items():
+    for name, fit_model in (models_of.MODELS if baselines else {}).items():
         try:
             other = fit_model(known, scene)
         except ValueError as error:
@@ -212,11 +213,9 @@ _ERRORS = {  # figure -> unit, what it is
 
 def comparison(scene: Scene, tests: Sequence[Any], baselines: bool) -> "xr.Dataset":
     """Return the errors of every combination of laws, fitted to all tests and with one and two of them left out."""
-    from hpgr.baselines import MODELS
-    from hpgr.results import schema
-
     named = [(laws.name, _refit(scene, laws)) for laws in COMBINATIONS]
-    named += [(name, lambda known, fit=fit: fit(known, scene)) for name, fit in (MODELS if baselines else {}).items()]
+    others = models_of.MODELS if baselines else {}
+    named += [(name, lambda known, fit=fit: fit(known, scene)) for name, fit in others.items()]
     values = np.full((1 + len(named), 3, len(_ERRORS)), np.nan)
     constants = np.zeros(len(values), int)
     measured = _exponents([(test, SimpleNamespace(**_measured(test))) for test in tests])
@@ -249,8 +248,6 @@ def comparison(scene: Scene, tests: Sequence[Any], baselines: bool) -> "xr.Datas
 
 def _refit(scene: Scene, laws: Laws) -> Callable[[list[Any]], Any]:
     """Return what fits a combination of laws to tests, each time from the first fit that was made."""
-    from hpgr import calibration
-
     share = {"edge_share": scene.roll_width.edge_share, "slices": scene.roll_width.slices}
     width = {"roll_width": laws.values["roll_width"] | share} if "roll_width" in laws.values else {}
     scene, first = scene.with_values(laws.values | width), []
@@ -276,10 +273,8 @@ def _left_out(tests: Sequence[Any], fit: Callable[[list[Any]], Any], count: int)
         return [(test, one.predict(test)) for test, one in found], len(fitted.constants)
     if count != 1:
         return [(test, one.predict(test, intervals=False)) for test, one in found], len(fitted.estimates)
-    from hpgr.calibration import discrepancy
-
     pairs = [(test, one._replace(discrepancy={}).predict(test)) for test, one in found]
-    told = [discrepancy(pairs[:k] + pairs[k + 1 :]) for k in range(len(pairs))]
+    told = [calibration.discrepancy(pairs[:k] + pairs[k + 1 :]) for k in range(len(pairs))]
     pairs = [(test, one._replace(discrepancy=off).predict(test)) for (test, one), off in zip(found, told, strict=True)]
     return pairs, len(fitted.estimates)
 
@@ -332,8 +327,6 @@ def _coverage(pairs: Sequence[tuple[Any, Any]]) -> dict[str, float]:
 
 def compared(result: "xr.Dataset") -> str:
     """Return the comparison as a table: median / largest error of the total product, and the rest."""
-    from studies.show.report import aligned
-
     rows = []
     for name in result["laws"].values:
         one = result["error"].sel(laws=name)
@@ -348,7 +341,7 @@ def compared(result: "xr.Dataset") -> str:
         rows.append(row)
     headings = ["laws", "n", "fit", "leave 1 out", "centre", "edge", *(f"{name} [%]" for name in "QPW")]
     headings += ["inside, width [%]", "leave 2 out", "gap exp.", "W exp."]
-    return aligned(headings, rows, words=1)
+    return report.aligned(headings, rows, words=1)
 
 
 # ---- one split
@@ -358,8 +351,6 @@ def assemble(
     tests: Sequence[Any], known: Sequence[str], models: Sequence[Model], scene: Scene, samples: dict[str, np.ndarray]
 ) -> "xr.Dataset":
     """Return measured and predicted figures of every test as one Dataset; NaN is not measured, or not predicted."""
-    from hpgr.results import schema
-
     sizes, shape = np.unique(np.concatenate([test.sizes for test in tests])), (1 + len(models), len(tests))
     values: dict[str, Any] = {"failure": np.full(shape, "", object)}
     for side in ("", "_lower", "_upper"):
@@ -390,20 +381,15 @@ def assemble(
 
 
 def _measured(test: Any) -> dict[str, Any]:
-    from hpgr.calibration import measured
-
-    return test._asdict() | {name: measured(test, name).item() for name in ("gap", "specific_energy")}
+    return test._asdict() | {name: calibration.measured(test, name).item() for name in ("gap", "specific_energy")}
 
 
 def _own(samples: dict[str, np.ndarray]) -> dict[str, Any]:
     """Return the table of the study's own variables."""
-    from hpgr.results.schema import VARIABLES, Variable
-    from hpgr.scene import field_info
-
     dims = ("source", "test")
-    figures = {name: VARIABLES[name]._replace(dims=dims, dtype=np.float64) for name in FIGURES} | {
-        "gap": Variable(dims, "m", "gap", "measured: working gap, or thickness of the cake", np.float64),
-        "passing": Variable((*dims, "part", "sieve"), "1", "mass fraction passing"),
+    figures = {name: schema.VARIABLES[name]._replace(dims=dims, dtype=np.float64) for name in FIGURES} | {
+        "gap": schema.Variable(dims, "m", "gap", "measured: working gap, or thickness of the cake", np.float64),
+        "passing": schema.Variable((*dims, "part", "sieve"), "1", "mass fraction passing"),
     }
     ends = {
         f"{name}_{side}": one._replace(long_name=f"{side} end of the 90 % interval of {one.long_name}")
@@ -412,13 +398,13 @@ def _own(samples: dict[str, np.ndarray]) -> dict[str, Any]:
     }
     words = {"source": "measurement or model", "test": "pilot test", "part": "part of the roll width"}
     told = {
-        "blind": Variable(("test",), "1", "whether the test was left out of the fit", dtype=np.int8),
-        "failure": Variable(dims, "", "why a model predicts nothing of a test", dtype=object),
+        "blind": schema.Variable(("test",), "1", "whether the test was left out of the fit", dtype=np.int8),
+        "failure": schema.Variable(dims, "", "why a model predicts nothing of a test", dtype=object),
     }
-    told |= {name: Variable((name,), "", each, dtype=object) for name, each in words.items()}
+    told |= {name: schema.Variable((name,), "", each, dtype=object) for name, each in words.items()}
     for name, info in zip(samples, map(field_info, samples), strict=True):
         drawn = f"{info.symbol}, drawn with its covariance"
-        told[name] = Variable(("sample",), info.unit, drawn, dtype=np.float64)
+        told[name] = schema.Variable(("sample",), info.unit, drawn, dtype=np.float64)
     return figures | ends | told
 
 
@@ -447,8 +433,6 @@ def words(result: "xr.Dataset", models: Sequence[Model]) -> list[str]:
 
 
 def _table(result: "xr.Dataset", name: str) -> str:
-    from studies.show.report import aligned
-
     rows = []
     for test in result["test"].values:
         one, measured = (result.sel(source=source, test=test) for source in (name, "measured"))
@@ -456,7 +440,7 @@ def _table(result: "xr.Dataset", name: str) -> str:
         errors = [_figure(100 * (one[key] / measured[key] - 1).item(), "+.1f") for key in FIGURES]
         rows.append([test, *shown, *errors, "blind" if one["blind"].item() else "", one["failure"].item()])
     headings = ["test", *(f"RMSE {part} [%]" for part in PARTS), "error of Q [%]", "P [%]", "W [%]", "", ""]
-    return aligned(headings, rows, words=1)
+    return report.aligned(headings, rows, words=1)
 
 
 def _figure(value: float, form: str) -> str:

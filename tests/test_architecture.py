@@ -37,6 +37,8 @@ def imports(tree, late=True):
             assert node.level == 0, "relative imports hide who imports whom"
             yield node.module
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif late and isinstance(node, ast.Call) and ast.unparse(node.func) == "Late":
+            yield node.args[0].value
 
 
 def packages(tree):

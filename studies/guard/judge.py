@@ -8,10 +8,14 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
+import hpgr
 from hpgr import presets
 from hpgr.fields import kinds_of
 from hpgr.scene import Scene
+from studies import Late
 from studies.guard import ranges
+
+cost, flags, invariants = Late("hpgr.cost"), Late("hpgr.results.flags"), Late("studies.guard.invariants")
 
 KINDS = ("ok", "flagged", "substepped", "refused", "fault")
 NO_LIMITS = {"unusual_machine", "feed_below_critical"}  # what machine and ore are usually like is no limit of the model
@@ -81,11 +85,6 @@ def judge(values: Mapping[str, Any], seed: int = 0) -> Outcome:
 
 
 def _run(scene: Scene, seed: int) -> Outcome:
-    import hpgr
-    from hpgr import cost
-    from hpgr.results import flags
-    from studies.guard import invariants
-
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")

@@ -5,12 +5,16 @@ import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from studies import Late
 from studies.command import progress_bar
 from studies.guard.judge import KINDS, Outcome, base
 
 if TYPE_CHECKING:
-    import numpy as np
     import xarray as xr
+
+run, flags, schema = Late("hpgr.run"), Late("hpgr.results.flags"), Late("hpgr.results.schema")
 
 _INF = math.inf
 _FINEST = 6400  # time steps of the bed that errors are measured against
@@ -36,17 +40,12 @@ MAPS: dict[str, dict[str, tuple[float, ...]]] = {  # the two fields of each and 
 
 def outcome_variables(prefix: str, dims: tuple[str, ...], outcomes: Sequence[Outcome], shape: tuple[int, ...]):
     """Return values, and the table of their variables, of outcome, flags and exchange substeps."""
-    import numpy as np
-
-    from hpgr.results import flags
-    from hpgr.results.schema import Variable
-
     meanings = {"flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": " ".join(KINDS)}
     found = np.array([[KINDS.index(each.kind), each.flags, each.substeps] for each in outcomes]).T.reshape(3, *shape)
     own = {
-        f"{prefix}outcome": Variable(dims, "1", "how the scene ended", "", np.int8, meanings),
-        f"{prefix}flags": Variable(dims, "1", "limits that were hit", "", np.int32, flags.ATTRIBUTES),
-        f"{prefix}substeps": Variable(dims, "1", "exchange substeps per time step", dtype=np.int32),
+        f"{prefix}outcome": schema.Variable(dims, "1", "how the scene ended", "", np.int8, meanings),
+        f"{prefix}flags": schema.Variable(dims, "1", "limits that were hit", "", np.int32, flags.ATTRIBUTES),
+        f"{prefix}substeps": schema.Variable(dims, "1", "exchange substeps per time step", dtype=np.int32),
     }
     return dict(zip(own, found, strict=True)), own
 
@@ -63,10 +62,6 @@ def maps(judge: Callable[..., Outcome], thin: int = 1, progress: bool = False) -
 
 
 def _map(name: str, axes: dict[str, tuple[float, ...]], judge: Callable[..., Outcome], bar: Any) -> "xr.Dataset":
-    import numpy as np
-
-    from hpgr.results import schema
-
     dims, shape = tuple(f"{name}_{field.partition('.')[2]}" for field in axes), tuple(map(len, axes.values()))
     outcomes = []
     for place in np.ndindex(shape):
@@ -84,36 +79,30 @@ def faults(result: "xr.Dataset") -> int:
 
 def _integrators(thin: int) -> "xr.Dataset":
     """Return the error of each integrator over exponent and time step."""
-    import numpy as np
-
-    from hpgr.results.schema import Variable, field_axis, to_dataset
-
     exponents, steps = _EXPONENTS[::thin], _STEPS[::thin]
     found = np.array([[_errors(c, count) for count in steps] for c in exponents])  # (exponent, steps, 5)
     dims, about = ("integrator", "exponent", "steps"), "at a point, over the largest pressure"
     own = {
-        "integrator": Variable(dims[:1], "", "how stress is integrated", dtype=None),
-        "exponent": field_axis("elasticity.exponent", "exponent"),
-        "steps": Variable(dims[2:], "1", "time steps per residence time", dtype=None),
-        "integrator_error": Variable(dims, "1", "largest error of pressure", about, np.float64),
-        "integrator_tension": Variable(dims, "1", "whether tension was held at 0", "or reverse shear", np.int8),
-        "integrator_settled": Variable(dims[1:], "1", "whether small time steps have a limit", dtype=np.int8),
+        "integrator": schema.Variable(dims[:1], "", "how stress is integrated", dtype=None),
+        "exponent": schema.field_axis("elasticity.exponent", "exponent"),
+        "steps": schema.Variable(dims[2:], "1", "time steps per residence time", dtype=None),
+        "integrator_error": schema.Variable(dims, "1", "largest error of pressure", about, np.float64),
+        "integrator_tension": schema.Variable(dims, "1", "whether tension was held at 0", "or reverse shear", np.int8),
+        "integrator_settled": schema.Variable(dims[1:], "1", "whether small time steps have a limit", dtype=np.int8),
     }
     values = {"integrator": INTEGRATORS, "exponent": exponents, "steps": steps}
     error, tension = np.moveaxis(found[..., :4].reshape(*found.shape[:2], 2, 2), (2, 3), (0, 1))
     measured = {"integrator_error": error, "integrator_tension": tension, "integrator_settled": found[..., 4]}
-    return to_dataset(values | measured, {}, own)
+    return schema.to_dataset(values | measured, {}, own)
 
 
 def _stress(c: float, steps: int, integrator: str) -> Any:
-    from hpgr import run
-
     bed = {"rolls.entry_gap": 1.14, "resolution.points": steps + 1, "resolution.cells": 0}
     return run.load(base({"elasticity.exponent": c, "elasticity.integrator": integrator} | bed))[1].stress
 
 
 @functools.cache
-def _limit(c: float) -> tuple["np.ndarray", bool]:
+def _limit(c: float) -> tuple[np.ndarray, bool]:
     """Return the pressure at many time steps, and whether half as many give the same."""
     fine, half = (_stress(c, steps, "increment").pressure for steps in (_FINEST, _FINEST // 2))
     return fine, bool(abs(fine[:, ::2] - half).max() <= _SETTLED * max(fine.max(), 1e-300))

@@ -13,6 +13,9 @@ from pydantic import ValidationError
 
 from hpgr.fields import Frozen, kinds_of, parts_of, values_of
 from hpgr.scene import Scene
+from studies import Late
+
+cost, machine = Late("hpgr.cost"), Late("hpgr.bed.machine")
 
 _DECADES = 9  # over which values are drawn where a range begins at 0 or has no upper end
 
@@ -139,8 +142,6 @@ def draw(base: Scene, generator: np.random.Generator, exchange: bool, most_secon
 
 def near_force(base: Scene, values: dict[str, Any], factor: float) -> dict[str, Any]:
     """Return the values with `factor` times the pressing force that the scene's own gap carries, if it carries any."""
-    from hpgr.bed import machine  # late: it compiles
-
     try:
         force = factor * machine.specific_pressing_force(base.with_values(values))
     except ValueError:
@@ -228,8 +229,6 @@ def _draw_resolution(exchange: bool, width: bool, generator: np.random.Generator
 
 def _affordable(base: Scene, values: dict[str, Any], most_seconds: float) -> dict[str, Any]:
     """Return the values with the largest count halved until the predicted cost is low enough."""
-    from hpgr.cost import predict
-
     counted = [name for name, known in numeric_fields().items() if known.whole]
     while True:
         try:
@@ -238,6 +237,6 @@ def _affordable(base: Scene, values: dict[str, Any], most_seconds: float) -> dic
             return values  # it will not be run
         known = values_of(scene)
         largest = max((name for name in counted if name in known), key=known.get)
-        if predict(scene).seconds <= most_seconds or known[largest] <= 4:
+        if cost.predict(scene).seconds <= most_seconds or known[largest] <= 4:
             return values
         values = values | {largest: known[largest] // 2}

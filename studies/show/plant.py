@@ -7,6 +7,7 @@ import xarray as xr
 
 from hpgr.fields import unit_shown
 from studies.command import quantity_of
+from studies.show import report
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,14 +46,10 @@ class Plant:
 
     def table(self, sieve: str = "1 mm") -> str:
         """Return the table of a sweep, a line for each operating point, as its command prints it."""
-        from studies.show import report
-
         return report.table(self._sweep(), quantity_of("sieve", sieve, "m"))
 
     def plot(self, sieve: str = "1 mm") -> "Figure":
         """Return the figure of a sweep, as its command draws it."""
-        from studies.show import report
-
         result, size = self._sweep(), quantity_of("sieve", sieve, "m")
         field = result.attrs["axes"].partition(",")[0]
         if not field:

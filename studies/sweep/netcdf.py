@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import h5py
+import netCDF4
 import numpy as np
 import xarray as xr
 from xarray.backends.locks import HDF5_LOCK, NETCDFC_LOCK, combine_locks
@@ -222,8 +224,6 @@ def shapes_in(path: str | Path) -> dict[str, tuple[int, ...]]:
 @contextmanager
 def _opened(path: str | Path) -> Iterator[Any]:
     """Open a file by the NetCDF library after a look at what it would make the library do."""
-    import netCDF4
-
     path = Path(path).absolute()  # the library takes other names for addresses on a network
     looked = _look(path)
     with _LIBRARY:
@@ -297,8 +297,6 @@ def _refuse_damaged(path: Path, file: BinaryIO) -> None:
 
 def _fault(path: Path) -> str | None:
     """Return what in an HDF5 file lies elsewhere, or is not to be walked through."""
-    import h5py
-
     with _LIBRARY:
         try:
             with h5py.File(path, "r") as file:
@@ -309,8 +307,6 @@ def _fault(path: Path) -> str | None:
 
 def _faults(item: Any, size: int, seen: set, depth: int) -> Iterator[str]:
     """Yield what about an HDF5 group or variable, and in it, is as in no file of ours."""
-    import h5py
-
     place, info = item.name, h5py.h5o.get_info(item.id)
     if (info.fileno, info.addr) in seen:
         yield f"{place} is in two places at once"
@@ -335,8 +331,6 @@ def _faults(item: Any, size: int, seen: set, depth: int) -> Iterator[str]:
 
 def _unpacked(texts: Any) -> int:
     """Return the bytes of a variable of texts, which may be one in many places; counted until it is too much."""
-    import h5py
-
     total, batch = 0, 1000
     for start in range(0, texts.size, batch):
         places = np.arange(start, min(start + batch, texts.size))
@@ -352,8 +346,6 @@ def _unpacked(texts: Any) -> int:
 
 def _foreign(place: str, plist: Any) -> Iterator[str]:
     """Yield what about the storage of a variable needs other files or code."""
-    import h5py
-
     if plist.get_external_count() or plist.get_layout() == h5py.h5d.VIRTUAL:
         yield f"{place} has its values in other files"
     foreign = [plist.get_filter(k)[0] for k in range(plist.get_nfilters())]

@@ -1,5 +1,6 @@
 """The command line that the sweeps over gap, speed and feed share."""
 
+import csv
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ from pydantic import ValidationError
 from hpgr import presets
 from hpgr.fields import check_number, faults_of, show, unit_shown
 from hpgr.scene import Scene, field_info
+from studies import Late
 from studies import command as line
 from studies.command import Report, shown_as
 from studies.sweep.space import AXES, SCENE, Axis, Space, SweepSpec, axes_of, dim_of, sobol_design
@@ -18,6 +20,8 @@ from studies.sweep.space import AXES, SCENE, Axis, Space, SweepSpec, axes_of, di
 if TYPE_CHECKING:
     import xarray as xr
 
+cost, machine, report = Late("hpgr.cost"), Late("hpgr.bed.machine"), Late("studies.show.report")
+cases = Late("studies.sweep.cases")
 
 _DRAWS = 32  # samples of a calibration
 _MOST_FORCE = 2.0  # on the narrowest gap of a default range, over that of the scene's own gap
@@ -219,8 +223,6 @@ def _carried(factors: tuple[float, ...], scenes: list[Scene]) -> tuple[float, ..
 
     Where the nip takes in what it grips, the bed would else be denser than rock: of `industrial` at 0.83 of its gap.
     """
-    from hpgr.bed import machine  # late: `--help` does without
-
     own, narrowest = scenes[0].rolls.gap, factors[0] * scenes[0].rolls.gap
     for scene in scenes:
         with suppress(ValueError):  # no gap carries as much
@@ -260,7 +262,7 @@ def _swept(scene: Scene, space: dict[Any, Any], options: Options, folder: Path) 
 
 
 def _report(field: str, caption: str, result: "xr.Dataset", sieve: float, options: Options) -> Report:
-    from studies.show import plant, report
+    from studies.show import plant
 
     lost = report.lost_cases(result)
     if not report.any_result(result):
@@ -277,10 +279,6 @@ def _report(field: str, caption: str, result: "xr.Dataset", sieve: float, option
 
 
 def _write_csv(path: Path, result: "xr.Dataset", sieve: float) -> None:
-    import csv
-
-    from studies.show import report
-
     with path.open("w", encoding="utf-8-sig", newline="") as file:  # with the mark by which spreadsheets know UTF-8
         csv.writer(file).writerows(report.csv_rows(result, sieve))
 
@@ -299,28 +297,25 @@ def _place(axis: Axis, index: int) -> list[str]:
 
 def _cases(scene: Scene, space: Space, options: Options, folder: Path) -> list[str]:
     """Return in words what a sweep would run: its operating points, with predicted memory and time."""
-    from hpgr.cost import predict
-    from studies.show.report import aligned
-    from studies.sweep.cases import code_version, finished
-
     scene = scene.with_values({"resolution.record": options.record})
-    spec = SweepSpec(scene, options.seed, options.tolerance, options.max_cost, code=code_version())
-    kept = {} if options.recompute else finished(spec, space, folder)
+    spec = SweepSpec(scene, options.seed, options.tolerance, options.max_cost, code=cases.code_version())
+    kept = {} if options.recompute else cases.finished(spec, space, folder)
     headings = [heading for dim, axis in space.axes.items() for heading in _headings(dim, axis)]
     rows, refused, seconds = [], [], 0.0
     for case in Space(space.axes).cases():
         axes = zip(space.axes.values(), case.index[:-1], strict=True)
         place = [text for axis, k in axes for text in _place(axis, k)]
         try:
-            cost = predict(scene.with_values(case.values))
+            predicted = cost.predict(scene.with_values(case.values))
         except ValidationError as error:
             refused.append(f"refused: {', '.join(place)}: {faults_of(error)}")
             continue
         done = kept.get(case.index[:-1], 0)
-        seconds += cost.seconds * (space.replicates - done)
-        figures = [f"{cost.bytes / 1e6:.1f} MB", f"{cost.seconds * 1e3:.1f} ms", f"{done} of {space.replicates}"]
-        rows.append([*place, *figures[: 3 if kept else 2]])
-    table = aligned([*headings, "memory", "time", *(["finished"] if kept else [])], rows)
+        seconds += predicted.seconds * (space.replicates - done)
+        figures = [f"{predicted.bytes / 1e6:.1f} MB", f"{predicted.seconds * 1e3:.1f} ms"]
+        figures += [f"{done} of {space.replicates}"] if kept else []
+        rows.append([*place, *figures])
+    table = report.aligned([*headings, "memory", "time", *(["finished"] if kept else [])], rows)
     lines = [f"{scene}\n", table, *refused, ""]
     if options.tolerance is not None:
         lines.append(
