@@ -159,7 +159,7 @@ def measured_crush():
     function = tree.body[0]
     function.decorator_list, arguments = [], function.args.args
     arguments.append(ast.arg("ticks"))
-    step = next(part for part in ast.walk(function) if isinstance(part, ast.If) and "np.inf" in ast.unparse(part.test))
+    step = next(part for part in ast.walk(function) if isinstance(part, ast.If) and ast.unparse(part.test) == "actives")
     called = [
         [call.func.id for call in ast.walk(part) if isinstance(call, ast.Call) and isinstance(call.func, ast.Name)]
         for part in step.body

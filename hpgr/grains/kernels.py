@@ -130,10 +130,7 @@ class Work(NamedTuple):
     verdicts: np.ndarray  # uint8, 1: breaks, 2: unsure
     states: np.ndarray  # uint64, of the streams of those that break
     ratios: np.ndarray  # float64, of fragments
-    ratio_bits: np.ndarray  # int64, the bits of these
     exponents: np.ndarray  # float64
-    powers: np.ndarray  # float64, of 2
-    power_bits: np.ndarray  # int64, the bits of these
 
 
 class Edges(NamedTuple):
@@ -171,9 +168,7 @@ def make_work(cells: int) -> Work:
     """Return work space for lines of this many cells; lists are written and read in whole vectors."""
     most = cells + 2 * BLOCK
     lists, known = np.empty((2, most), np.uint32), np.ones((4, most), np.float32)
-    ratios, exponents, powers = np.ones((3, most))
-    of_powers = ratios, ratios.view(np.int64), exponents, powers, powers.view(np.int64)
-    return Work(*lists, *known, np.empty(most, np.uint8), np.empty(most, np.uint64), *of_powers)
+    return Work(*lists, *known, np.empty(most, np.uint8), np.zeros(most, np.uint64), *np.ones((2, most)))
 
 
 # --- vectors ------------------------------------------------------------------------------------------------
@@ -360,37 +355,28 @@ def classify(sizes, slot, sieves, k, counts):
 
 
 @_inlined
-def _raise(count, values, bits, exponents, powers, power_bits):
-    """Raise numbers v > 0 to their exponents, v^e = 2^(e log2 v).
+def _power(value, exponent):
+    """Return value^exponent of a value > 0, v^e = 2^(e log2 v), to 6e-11.
 
-    `bits` and `power_bits` are the bits of `values` and of the work space `powers`. In plain arithmetic, which unlike
-    calls becomes vectors (40 -> 3 ns a value), to about 1e-13; series in pairs of terms, for a step raises few numbers
-    and would wait for a sum of one term after the other.
+    In plain arithmetic, which unlike calls becomes vectors (10 -> 2.5 ns a value); series in pairs of terms, for a step
+    raises few numbers and would wait for a sum of one term after the other.
     """
-    for k in range(count):  # mantissa between sqrt(1/2) and sqrt(2), power of 2
-        shift = (bits[k] - np.int64(0x3FE6A09E667F3BCD)) >> np.int64(52)
-        bits[k] -= shift << np.int64(52)
-        power_bits[k] = shift
-    for k in range(count):
-        z = (values[k] - 1.0) / (values[k] + 1.0)
-        y = z * z
-        y2 = y * y
-        y4 = y2 * y2
-        first, second = 2.0 + y * (2 / 3) + y2 * (2 / 5 + y * (2 / 7)), 2 / 9 + y * (2 / 11)
-        logarithm = z * (first + y4 * (second + y2 * (2 / 13 + y * (2 / 15)) + y4 * (2 / 17 + y * (2 / 19))))
-        wanted = (np.float64(power_bits[k]) + logarithm * 1.4426950408889634) * exponents[k]
-        above = wanted if wanted > -1000.0 else -1000.0
-        power = above if above < 100.0 else 100.0
-        whole = np.floor(power + 0.5)
-        r = (power - whole) * 0.6931471805599453
-        r2 = r * r
-        r4 = r2 * r2
-        first, second = 1.0 + r + r2 * (0.5 + r * (1 / 6)), 1 / 24 + r * (1 / 120) + r2 * (1 / 720 + r * (1 / 5040))
-        third = 1 / 40320 + r * (1 / 362880) + r2 * (1 / 3628800 + r * (1 / 39916800))
-        values[k] = first + r4 * (second + r4 * third)
-        power_bits[k] = (np.int64(whole) + np.int64(1023)) << np.int64(52)
-    for k in range(count):
-        values[k] *= powers[k]
+    bits = np.float64(value).view(np.int64)
+    shift = (bits - np.int64(0x3FE6A09E667F3BCD)) >> np.int64(52)  # mantissa between sqrt(1/2) and sqrt(2), power of 2
+    mantissa = np.int64(bits - (shift << np.int64(52))).view(np.float64)
+    z = (mantissa - 1.0) / (mantissa + 1.0)
+    y = z * z
+    y2 = y * y
+    first, second = 2.0 + y * (2 / 3) + y2 * (2 / 5 + y * (2 / 7)), 2 / 9 + y * (2 / 11) + y2 * (2 / 13 + y * (2 / 15))
+    wanted = (np.float64(shift) + z * (first + y2 * y2 * second) * 1.4426950408889634) * exponent
+    above = wanted if wanted > -1000.0 else -1000.0
+    power = above if above < 100.0 else 100.0
+    whole = np.floor(power + 0.5)
+    r = (power - whole) * 0.34657359027997264
+    r2 = r * r
+    first, second = 1.0 + r + r2 * (1 / 2 + r * (1 / 6)), 1 / 24 + r * (1 / 120) + r2 * (1 / 720 + r * (1 / 5040))
+    root = first + r2 * r2 * second
+    return root * root * np.int64((np.int64(whole) + np.int64(1023)) << np.int64(52)).view(np.float64)
 
 
 @_inlined
@@ -523,13 +509,13 @@ def _list_breaks(candidates, found_bounds, verdicts, bounds, places):
 
 
 @_inlined
-def _draw(streams, places, found, states, ratios):
-    """Draw a uniform number for each cell that breaks."""
+def _draw(streams, places, found, whole, states, ratios):
+    """Draw a uniform number for each cell that breaks; what is drawn beyond them, in whole vectors, is not read."""
     for k in range(found):
         p = places[k]
         states[k] = streams[p] + _GOLDEN
         streams[p] = states[k]
-    for k in range(found):
+    for k in range(whole):
         ratios[k] = uniform(states[k])
 
 
@@ -542,26 +528,29 @@ def _exponent_of(exponent, size, ore):
 
 
 @_inlined
-def _raise_ratios(exponent, sizes, streams, places, found, ore, ratios, exponents, work):
+def _raise_ratios(exponent, sizes, streams, places, found, whole, ore, own, ratios, exponents, unsure):
     """Raise the fragment ratios to the exponents of their parents, where there are any.
 
     The library's power, which the bits are defined by, is taken where ours may give another float32: next to a half.
     """
     if exponent is not None:
-        whole, doubts = (found + BLOCK - 1) // BLOCK * BLOCK, np.int64(0)
+        doubts = np.int64(0)
         for k in range(whole):
             exponents[k] = exponent
+        for k in range(found):
+            own[k] = sizes[places[k]]
         if ore.size_exponent != 0.0:
             for k in range(found):
-                exponents[k] = _exponent_of(exponent, sizes[places[k]], ore)
-        _raise(whole, ratios, work.ratio_bits, exponents, work.powers, work.power_bits)
-        for k in range(found):
-            size, ratio = sizes[places[k]], ratios[k]
-            doubts += np.float32(size * (ratio * (1.0 - 1e-12))) != np.float32(size * (ratio * (1.0 + 1e-12)))
+                exponents[k] = _exponent_of(exponent, own[k], ore)
+        for k in range(whole):
+            ratios[k] = _power(ratios[k], exponents[k])
+            size = own[k] * ratios[k]
+            doubt = np.float32(size * (1.0 - 1e-10)) != np.float32(size * (1.0 + 1e-10))
+            doubts += doubt
+            unsure[k] = doubt
         for k in range(found if doubts else 0):
-            p = places[k]
-            if np.float32(sizes[p] * (ratios[k] * (1.0 - 1e-12))) != np.float32(sizes[p] * (ratios[k] * (1.0 + 1e-12))):
-                ratios[k] = uniform(streams[p]) ** exponents[k]
+            if unsure[k]:
+                ratios[k] = uniform(streams[places[k]]) ** exponents[k]
 
 
 @_inlined
@@ -624,8 +613,7 @@ def crush(parcels, passage, path, ore, work, record):
     number of its place's stream. One call for many parcels: a thread that waits for its turn between short calls would
     lose what a second core gains (2 threads: 1.0 -> 1.7 times one).
     """
-    active, places, before, own, after, weak, verdicts = work[:7]
-    states, ratios = work.states, work.ratios
+    active, places, before, own, after, weak, verdicts, states, ratios, exponents = work
     log_stress, critical_ratio = path
     sieves, counts = record.sieves, record.counts
     cells = parcels.sizes.shape[1] - 2
@@ -636,12 +624,14 @@ def crush(parcels, passage, path, ore, work, record):
         classify(parcels.sizes, slot, sieves, k, counts)
         for j in range(passage.first[k], passage.last[k]):
             critical = critical_ratio[line, j]
+            actives = 0
             if critical < np.inf:
                 if parcels.bounds_outdated[slot]:
                     _set_bounds(sizes, weakness, slot, bounds, block_bounds, ore)
                     parcels.bounds_outdated[slot] = False
                 needed = np.float32(critical if critical < 3e38 else 3e38)  # beyond every effective size of float32
                 actives = _list_blocks(needed, block_bounds, active)
+            if actives:
                 count = _list_candidates(needed, bounds, active, actives, places)
                 _gather(sizes, weakness, slot, places, count, before, own, after, weak)
                 if ore.strength == SIZE_EFFECT:
@@ -652,10 +642,11 @@ def crush(parcels, passage, path, ore, work, record):
                         _decide_by_logarithms(count, sizes, weakness, slot, places, ore, level, before, verdicts)
                 found = _list_breaks(count, before, verdicts, bounds, places)
                 _count(sizes, places, found, sieves, k, np.int64(-1), counts)
-                _draw(streams, places, found, states, ratios)
-                if found and ore.fragments == POWER_LAW:
-                    exponent, exponents = ore.inverse_exponent, work.exponents
-                    _raise_ratios(exponent, sizes, streams, places, found, ore, ratios, exponents, work)
+                whole = (found + BLOCK - 1) // BLOCK * BLOCK
+                _draw(streams, places, found, whole, states, ratios)
+                if ore.fragments == POWER_LAW:
+                    exponent, unsure = ore.inverse_exponent, verdicts
+                    _raise_ratios(exponent, sizes, streams, places, found, whole, ore, own, ratios, exponents, unsure)
                 _draw_strength(streams, weakness, slot, places, found, ore)
                 _break(sizes, weakness, slot, bounds, places, found, ore, ratios)
                 _count(sizes, places, found, sieves, k, np.int64(1), counts)
