@@ -31,7 +31,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import optimize
 
-from hpgr.calibration import PARTS, measured
+from hpgr.calibration import PARTS, Prediction, measured
 from hpgr.laws.flow import cake_nip_angle, densest_ratio
 from hpgr.scene import Scene
 from hpgr.tables import PilotTest
@@ -48,18 +48,6 @@ class Machine(NamedTuple):
     solid_density: float  # kg m-3
     bulk_density: float  # of the feed at the nip, kg m-3
     cake_density: float  # of the cake leaving the gap, kg m-3
-
-
-class Prediction(NamedTuple):
-    """What a model says of a test, on the sieves of that test; NaN is "the model does not say"."""
-
-    sizes: np.ndarray  # (size,) m, rising
-    centre: np.ndarray  # (size,) fraction passing
-    edge: np.ndarray
-    total: np.ndarray
-    throughput: float  # kg s-1
-    power: float  # W
-    specific_energy: float  # J kg-1
 
 
 class TorresCasali(NamedTuple):
@@ -121,7 +109,7 @@ class TorresCasaliModel(NamedTuple):
         energies = watts / flow * self.blocks * power_shares(self.blocks)
         masses = block_products(parameters, test.sizes, test.feed, energies, self.reference_size)
         passing = {name: np.cumsum(part[::-1]) for name, part in combine(masses, parameters.edge_share).items()}
-        return Prediction(test.sizes, **passing, throughput=flow, power=watts, specific_energy=watts / flow)
+        return Prediction(math.nan, flow, watts, watts / flow, **passing)
 
 
 class HindeKalalaModel(NamedTuple):
@@ -133,10 +121,10 @@ class HindeKalalaModel(NamedTuple):
     def predict(self, parameters: HindeKalala, test: PilotTest) -> Prediction:
         """Return products and specific energy of `test`, from its feed and specific pressing force only.
 
-        The model says nothing of throughput and power: they are NaN. As a population balance: a class between the
-        sieves x_j > x_{j+1} breaks at the rate K(x_{j+1}), the decay of the sieve below it, and of what breaks the
-        share K(x)/K(x_{j+1}) passes the sieve x. With rates and fragments so tied ("compensation") the cumulative
-        balance has the exact solution R(x, E) = R(x, 0) exp(-K(x) E).
+        The model says nothing of throughput and power: they are NaN, as is the gap in both models. As a population
+        balance: a class between the sieves x_j > x_{j+1} breaks at the rate K(x_{j+1}), the decay of the sieve below
+        it, and of what breaks the share K(x)/K(x_{j+1}) passes the sieve x. With rates and fragments so tied
+        ("compensation") the cumulative balance has the exact solution R(x, E) = R(x, 0) exp(-K(x) E).
         """
         energy = self.energy_per_force * test.specific_pressing_force
         share, ratio = parameters.edge_share, parameters.edge_energy
@@ -146,7 +134,7 @@ class HindeKalalaModel(NamedTuple):
             for each in (energy * (1 - share * ratio) / (1 - share), energy * ratio)
         )
         total = share * edge + (1 - share) * centre
-        return Prediction(test.sizes, centre, edge, total, math.nan, math.nan, specific_energy=energy)
+        return Prediction(math.nan, math.nan, math.nan, energy, centre, edge, total)
 
 
 class Fit(NamedTuple):

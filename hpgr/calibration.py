@@ -7,8 +7,7 @@ torque, belong to a machine and a feed. Every evaluation draws the same random n
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import combinations
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -264,18 +263,13 @@ def fit_tests(
     return _calibration(problem, place, slopes, free)
 
 
-def left_out(found: Calibration, count: int = 1) -> Iterator[tuple[PilotTest, Calibration]]:
-    """Yield every test with a fit to the others, `count` of them left out at a time."""
-    problem = found.problem
-    for out in combinations(range(len(problem.tests)), count):
-        kept = [test for k, test in enumerate(problem.tests) if k not in out]
-        fitted = fit_tests(problem.scene, kept, problem.names, problem.feed, near=found)
-        yield from ((problem.tests[k], fitted) for k in out)
-
-
 def validated(found: Calibration) -> Calibration:
     """Return the calibration with the discrepancy that leaving out one test at a time tells."""
-    pairs = [(test, other._replace(discrepancy={}).predict(test)) for test, other in left_out(found)]
+    problem, pairs = found.problem, []
+    for k, test in enumerate(problem.tests):
+        others = problem.tests[:k] + problem.tests[k + 1 :]
+        fitted = fit_tests(problem.scene, others, problem.names, problem.feed, near=found)
+        pairs.append((test, fitted._replace(discrepancy={}).predict(test)))
     return found._replace(discrepancy=discrepancy(pairs))
 
 
@@ -298,7 +292,7 @@ def _scale(value: np.ndarray, name: str) -> np.ndarray:
     return 2 * np.sqrt(np.clip(value * (1 - value), 0, None)) if name in PARTS else value
 
 
-def predict(scene: Scene, test: PilotTest, feed: Feed | None = None) -> Prediction:
+def predict(scene: Scene, test: PilotTest) -> Prediction:
     """Return what `scene` says of a test, from its machine, feed, speed and force.
 
     Examples
@@ -313,7 +307,7 @@ def predict(scene: Scene, test: PilotTest, feed: Feed | None = None) -> Predicti
     >>> abs(said.power / first.power - 1) < 0.1
     True
     """
-    return _predict(_at_test(scene.with_values({"resolution.record": "product"}), test, feed))
+    return _predict(_at_test(scene.with_values({"resolution.record": "product"}), test))
 
 
 class _Problem:
@@ -497,7 +491,7 @@ def _both(said: Prediction, test: PilotTest, name: str) -> tuple[np.ndarray, np.
     return value - seen[kept], _scale(value, name), np.broadcast_to(reach / (2 * _LEVEL), seen.shape)[kept]
 
 
-def _at_test(scene: Scene, test: PilotTest, feed: Feed | None) -> Scene:
+def _at_test(scene: Scene, test: PilotTest, feed: Feed | None = None) -> Scene:
     """Return the scene at the machine, speed, force and feed of a test, with its sieves."""
     known, rolls = ~np.isnan(test.feed), scene.rolls
     diameter = rolls.diameter if math.isnan(test.diameter) else test.diameter

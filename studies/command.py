@@ -85,6 +85,7 @@ Exchange = Annotated[
 ]
 Replicates = Annotated[int, shown_as("N", "Independent repetitions of every operating point; they make the spread.")]
 Seed = Annotated[int, shown_as("N", "Seed of all randomness; the same seed gives the same bits.")]
+Workers = Annotated[int, shown_as("N", "Threads of this process to run cases on.")]
 Sieve = Annotated[str, shown_as("LENGTH", "Sieve whose percent passing is shown.")]
 Quick = Annotated[
     Flag, tyro.conf.arg(help="Fewer and coarser runs: seconds instead of minutes, to see what comes out.")

@@ -345,8 +345,7 @@ class Options(line.Common):
     subject_to: Annotated[tuple[str, ...], shown_as("BOUND ...")] = ()
     """Bounds, such as "passing 6 mm >= 60 %" "throughput >= 200 t/h"."""
     scene: line.SceneName = "industrial"
-    workers: Annotated[int, shown_as("N")] = 2
-    """Threads of this process to run the design on."""
+    workers: line.Workers = 2
     out: line.Out = Path("outputs/optimum.nc")
 
 

@@ -38,8 +38,7 @@ class Options(line.Common):
     """Points of the design, a power of two; N (fields + 2) cases are run."""
     scene: line.CalibratedScene = None
     sieve: line.Sieve = "1 mm"
-    workers: Annotated[int, shown_as("N")] = 2
-    """Threads of this process to run cases on."""
+    workers: line.Workers = 2
     out: line.Out = Path("outputs/sensitivity.nc")
 
 

@@ -72,10 +72,9 @@ class Options:
     max_cost: Annotated[float, shown_as("SECONDS")] = 60.0
     """Predicted time that meeting the tolerance may take at an operating point."""
     sieve: line.Sieve = "1 mm"
-    workers: Annotated[int, shown_as("N")] = 2
-    """Threads of this process to run cases on; without effect beside --scheduler."""
+    workers: line.Workers = 2
     scheduler: Annotated[str | None, shown_as("ADDRESS")] = None
-    """Running dask scheduler to use instead, such as tcp://127.0.0.1:8786."""
+    """Running dask scheduler to use instead of threads, such as tcp://127.0.0.1:8786."""
     exchange: line.Exchange = False
     record: Literal["product", "distributions", "cells"] = "product"
     """What is kept of every case beside its summary: a file of distributions or cells, for studies.open_cases."""
