@@ -99,7 +99,7 @@ def test_far_above_the_critical_size_a_steep_exponent_overflows_in_silence():
 def test_scatter_and_parents_of_the_closed_form_are_the_march_run_to_completion(constants):
     """A16, A17. KS for plain sampling: by chance once in a million; the cascade's own error is below 1e-4.
 
-    Below a twentieth of the size floor, where parents of 1 um may leave much, the closed form tells nothing.
+    Below a twentieth of the size floor, where parents of 1 um may leave much, it is told by the finest class.
     """
     cells, critical, feed = sized(50_000, 1_000), 0.007, FEEDS["uniform"]
     law = laws(**constants)
@@ -137,3 +137,28 @@ def test_where_nothing_breaks_the_classes_leave_the_feed_itself():
     for floor in ("59.9 mm", "60 mm", "100 mm"):  # once a negative number of classes
         dataset = simulate(paper(values | {"strength.scatter": 3.0, "fragments.size_floor": floor}))
         np.testing.assert_allclose(dataset["passing_total"], expected, atol=2e-3)
+
+
+@pytest.mark.parametrize("size", [0.008, 0.03, 0.04, 0.08])
+def test_cascade_holds_all_of_a_feed_of_one_size(size):
+    """exp(log(size)) may be less than the size, which no grain of the feed passes: the product was then the feed."""
+    law = laws(gamma=0.4, nu=1e-12)
+    passing, breaks = crushed(SingleFeed(size=size), law.strength, law.fragments, np.array([size / 10]))
+    assert float(breaks()[0]) == pytest.approx(1 + 0.4 * math.log(10), abs=8e-3)
+    assert float(passing(size=np.array([size / 100]))[0]) == pytest.approx(0.1**0.4, rel=1e-2)
+
+
+def test_scattered_strengths_under_a_stress_that_breaks_finer_grains_than_the_floor():
+    """B(s) = 1 - exp(-(s/s_c)^m) is 1 at the floor where s_c is far below it: nothing above the floor is left."""
+    values = {"strength.cushioning": math.inf, "strength.scatter": 2.0, "strength.reference_strength": 1.0}
+    dataset = simulate(paper(values | {"resolution.record": "product", "resolution.sieves": [1.1e-6, 1e-3]}))
+    assert dataset["passing"].values == pytest.approx(1.0, abs=1e-6)  # once 0.97
+
+
+def test_far_below_the_size_floor_passing_is_a_power_of_size():
+    """A1 with s_c at the floor, 1 um: once as much passed any finer size as a twentieth of it, and P50 was 1e-30 m."""
+    law = laws(gamma=0.1, nu=1e-12)
+    passing, _ = crushed(FEEDS["uniform"], law.strength, law.fragments, np.array([1e-9]))
+    sizes = np.geomspace(1e-25, 1e-6, 40)
+    assert passing(size=sizes[:, None])[:, 0] == pytest.approx((sizes / 1e-6) ** 0.1, rel=1e-3)
+    assert percentile(passing, np.array([0.2]), 0.06) == pytest.approx(0.2**10 * 1e-6, rel=1e-2)

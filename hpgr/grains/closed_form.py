@@ -27,9 +27,12 @@ _BELOW_FLOOR = 0.05  # the finest class of the cascade over the size floor
 def crushed(feed: Feed, strength: Strength, fragments: Fragments, critical: np.ndarray) -> tuple[Callable, Callable]:
     """Return the product of complete crushing: its passing as a function of size, m, and what gives breaks per grain.
 
-    `critical` is any array of critical sizes, m, held at the size floor or above; sizes are broadcast against it.
+    `critical` is any array of critical sizes, m; sizes are broadcast against it. It is held at the size floor, but not
+    where strengths scatter: there the chance of a grain above the floor goes on rising as it falls below the floor.
     """
-    if math.isinf(strength.scatter) and fragments.size_exponent == 0:
+    scattered = math.isfinite(strength.scatter)
+    critical = np.maximum(critical, _FINEST if scattered else fragments.size_floor)
+    if not scattered and fragments.size_exponent == 0:
         passing = partial(_crushed_passing, feed, critical, fragments.exponent, 1 - feed.passing(critical))
         return passing, partial(expected_breaks, feed, critical, fragments.exponent)
     edges, cumulative, breaks = _cascade(feed, strength, fragments, critical.ravel())
@@ -59,7 +62,8 @@ def _cascade(feed: Feed, strength: Strength, fragments: Fragments, critical: np.
     kept = np.maximum(gamma * (1 - chance) * width, 1e-9)
     within = -np.expm1(-kept) / kept
     leaving = np.pad(chance * within, ((1, 0), (0, 0)))
-    feed_mass = np.diff(feed.passing(np.exp(edges)), prepend=0.0)
+    sizes = np.append(np.exp(edges[:-1]), feed.largest_grain)  # exp(log(s)) may be less than s, which no grain passes
+    feed_mass = np.diff(feed.passing(sizes), prepend=0.0)
     ever = np.repeat(feed_mass[:, None], critical.size, axis=1)
     kernels.cascade(ever, leaving, np.pad(np.exp(-gamma[:, 0] * width), (1, 0)))
     tries = chance * (1 + chance * (1 - within) / np.maximum(1 - chance, 1e-9 / (gamma * width)))
@@ -69,14 +73,21 @@ def _cascade(feed: Feed, strength: Strength, fragments: Fragments, critical: np.
 
 
 def _between(edges: np.ndarray, cumulative: np.ndarray, size) -> np.ndarray:
-    """Return passing at sizes (..., *line), m, linear in log size between the edges of the cascade's classes."""
+    """Return passing at sizes (..., *line), m, linear in log size between the edges of the cascade's classes.
+
+    Below them, where nothing breaks, it goes on as the power of size that it is across the finest class: exact for
+    fragments of one exponent.
+    """
     size = np.broadcast_to(size, np.broadcast_shapes(np.shape(size), cumulative.shape[1:]))
     cumulative = np.broadcast_to(cumulative, cumulative.shape[:1] + size.shape[size.ndim - cumulative.ndim + 1 :])
-    place = (np.log(np.maximum(size, math.exp(edges[0]))) - edges[0]) / (edges[1] - edges[0])
+    place = (np.log(size) - edges[0]) / (edges[1] - edges[0])
     before = np.clip(place.astype(int), 0, edges.size - 2)
     lines = np.ogrid[tuple(slice(n) for n in size.shape)][size.ndim - cumulative.ndim + 1 :]
     low, high = cumulative[(before, *lines)], cumulative[(before + 1, *lines)]
-    return low + (high - low) * np.minimum(place - before, 1.0)
+    beside = np.divide(low, high, out=np.zeros_like(low), where=high > 0)
+    return np.where(
+        place < 0, low * beside ** np.maximum(-place, 0.0), low + (high - low) * np.minimum(place - before, 1.0)
+    )
 
 
 def crushed_passing(feed: Feed, size, critical, gamma: float) -> np.ndarray:

@@ -156,7 +156,6 @@ def _of_runs(passings: list[Callable], size: np.ndarray) -> np.ndarray:
 def _complete(scene: Scene, highest: np.ndarray, slices: Slices) -> tuple[Callable, Callable]:
     """Return what is known of crushing without cushioning at the highest stress of each slice and streamline."""
     critical = scene.strength.critical_size(highest + np.log(slices.pressure).reshape(-1, *(1,) * highest.ndim))
-    critical = np.maximum(critical, scene.fragments.size_floor)
     return closed_form.crushed(scene.feed, scene.strength, scene.fragments, critical)
 
 
