@@ -1,12 +1,9 @@
 """Motion of the bed: the kernels against the velocity fields that the laws of flow write out in NumPy."""
 
-import gc
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numba.core.event import end_event, trigger_event
 from scipy.integrate import quad
 from support import paper, sized
 
@@ -290,19 +287,3 @@ def test_force_does_not_jump_as_the_onset_of_compaction_crosses_a_point(values):
         assert others == pytest.approx(strain, rel=1e-6)
         force = machine.specific_pressing_force(scene)
         assert machine.specific_pressing_force(other) == pytest.approx(force, rel=1e-6)
-
-
-def test_no_garbage_is_collected_while_functions_are_compiled():
-    with trigger_event("numba:compile"):
-        with trigger_event("numba:compile"):  # a function that the first one calls
-            pass
-        assert not gc.isenabled()
-    assert gc.isenabled()
-    end_event("numba:compile")  # of one that has begun before the package was imported
-    gc.disable()
-    try:
-        with trigger_event("numba:compile"):
-            pass
-        assert not gc.isenabled()  # as the user wished
-    finally:
-        gc.enable()

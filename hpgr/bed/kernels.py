@@ -4,41 +4,20 @@ Streamlines do not know of each other. Arrays are (streamline, point), or (point
 a `hpgr.bed.geometry.Geometry`, `flow` and `elastic` are the constants of a law. A law has one branch, on its tag: a
 speed profile in `_descent`, an elastic law in `_response`. The tests hold each against its law's NumPy equation.
 
-Written to compile fast: few functions, without `min` and `max`, slices and allocations, 15 to 60 ms each.
+Written to compile fast: few functions, without `min` and `max`, slices and allocations, 15 to 60 ms each. Python runs
+the first beds of a process all the same.
 """
 
-import gc
 import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
-from numba.core import event
 
+from hpgr import compiler
 from hpgr.laws.flow import NIP, POWER
 
-# no rewrites, for nothing here is optional or a whole array: 7 % of the compile time saved
-_HOW = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "no_rewrites": True}
-_compiled = njit(**_HOW)
-_inner = njit(**_HOW, no_cpython_wrapper=True)  # not to be called from Python: a fifth of the compile time saved
-
-
-class _Uncollected(event.Listener):
-    """Lets no garbage be collected while numba compiles, one function at a time: it takes a tenth of the time."""
-
-    def __init__(self):
-        self.collecting = []
-
-    def on_start(self, _):
-        self.collecting.append(gc.isenabled())
-        gc.disable()
-
-    def on_end(self, _):
-        if self.collecting and self.collecting.pop():  # another thread may have compiled when this was imported
-            gc.enable()
-
-
-event.register("numba:compile", _Uncollected())
+_HOW = {"no_rewrites": True}  # for nothing here is optional or a whole array: 7 % of the compile time saved
+_compiled, _inner = compiler.deferred(**_HOW), compiler.inner(**_HOW)
 
 _PANELS = 64  # 5-point Gauss on 64 panels: travel times to 1e-13 for every entry_fraction down to 1e-9
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)

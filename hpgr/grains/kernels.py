@@ -19,19 +19,17 @@ from typing import NamedTuple
 
 import numpy as np
 from llvmlite import ir
-from numba import config, njit, types
+from numba import config, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from hpgr import compiler
 from hpgr.laws.fragments import HELD, POWER_LAW
 from hpgr.laws.strength import SIZE_EFFECT
 
-_HOW = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-_compiled = njit(**_HOW)
-# Functions that Python does not call need no wrappers, which cost most of the time to compile; and handing the arrays
-# of a step over costs as much as a short loop. A function costs 15 ms to compile, a `min` or `max` of new types 40
-_inner = njit(**_HOW, no_cpython_wrapper=True)
-_inlined = njit(**_HOW, no_cpython_wrapper=True, forceinline=True)
+# Handing the arrays of a step over costs as much as a short loop. A function costs 15 ms to compile, a `min` or `max`
+# of new types 40
+_compiled, _inner, _inlined = compiler.compiled(), compiler.inner(), compiler.inner(forceinline=True)
 
 BLOCK = 16  # cells; as many as the vectors below
 DENSE = 1 / 64  # swap probability of an edge from which deciding every cell is cheaper than skipping
@@ -304,7 +302,7 @@ def start_parcels(bases, ore, slots, uniforms, streams, weakness):
 # --- sieves -------------------------------------------------------------------------------------------------
 
 
-@_compiled
+@compiler.deferred()
 def passing_counts(rows, sizes, counts):
     """Fill counts (row, size) with the cells of each sorted row that are no larger than sizes (size, row or 1)."""
     for k in range(rows.shape[0]):
