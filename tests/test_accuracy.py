@@ -61,13 +61,6 @@ def test_the_lattice_without_swaps_is_the_march(measured):
     assert list(accuracy._solvers(paper({"strength.weibull_modulus": "inf"}))) == ["march", "lattice"]
 
 
-def test_so_weak_a_cushioning_is_none():
-    """The same bits as n = inf, which has to record cells to be marched."""
-    scene = paper({"strength.cushioning": "inf", "resolution.record": "cells"})
-    free = scene.with_values({"strength.cushioning": accuracy._FREE})
-    np.testing.assert_array_equal(*(run_scene(each).values["size"] for each in (scene, free)))
-
-
 def test_replicates_share_their_random_numbers_over_points():
     """Grains that do not cushion each other draw the same fragments whatever the time step, if it is small enough."""
     plan = TINY._replace(points=(101, 201, 401), many_cells=60, replicates=6)

@@ -230,12 +230,6 @@ def test_unknown_tests_are_refused(tests, got):
         hpgr.calibrate(start(), None, PSD, OPERATIONS, tests=tests)
 
 
-def test_bounds_and_scales_go_there_and_back():
-    for parameter in PARAMETERS.values():
-        for value in (parameter.low, parameter.high):
-            assert parameter.value(parameter.scaled(value)) == pytest.approx(value, rel=1e-12, abs=1e-12)
-
-
 def test_the_gap_is_the_working_gap_unless_the_cake_would_be_denser_than_rock(pilot_tests):
     test = pilot_tests["K-P1"]._replace(diameter=0.8, width=0.25, solid_density=2740.0)
     assert calibration.measured(test, "gap") == test.cake_thickness

@@ -150,15 +150,6 @@ def test_what_is_recorded_is_not_corrected(record):
     assert percentile_size(corrected, 80, total=True) == corrected["p80_total"]
 
 
-def test_replicates_at_once_are_those_one_by_one():
-    scene, bed = load(paper(BASE | {"resolution.cells": 50}))
-    [together] = solve.crush([Loaded(scene, bed, [2, 0])], 7)
-    for replicate, found in zip((2, 0), together, strict=True):
-        [[alone]] = solve.crush([Loaded(scene, bed, [replicate])], 7)
-        for name in ("passing", "percentiles", "total_percentiles", "breaks", "below_floor"):
-            assert np.array_equal(getattr(alone, name), getattr(found, name)), name
-
-
 @pytest.mark.parametrize("values", SCENES.values(), ids=SCENES)
 def test_percentiles_and_passing_agree(values):
     """Of a streamline, of the total: what passes the size read as P50 is half, but for a few cells."""

@@ -60,16 +60,6 @@ def test_rates_of_one_edge_by_hand():
     assert found.pairs.tolist() == [[1, 0]]
 
 
-def test_rates_are_proportional_to_their_coefficient_and_know_no_other():
-    plain, more = one_edge(0.1, 0.2), one_edge(0.4, 1.6)
-    assert more.rise == pytest.approx(4 * plain.rise, rel=1e-12)
-    assert more.mixing == pytest.approx(8 * plain.mixing, rel=1e-12)
-    assert one_edge(0.0, 0.2).rise == 0
-    assert one_edge(0.1, 0.0).mixing == 0
-    assert one_edge(0.0, 0.2).mixing == plain.mixing
-    assert one_edge(0.1, 0.0).rise == plain.rise
-
-
 def test_rates_are_never_negative():
     for gap in (1e-6, 0.06, 1.0):
         scene = mixed({"rolls.gap": gap, "rolls.entry_gap": gap + 1.08})
@@ -219,19 +209,6 @@ def test_absurd_exchange_is_refused_with_its_cost():
         simulate(scene.with_values({"exchange.mixing": 100}))
     for part in ("must be at most 1,000", "predicted cost above", " s; use fewer points"):
         assert part in str(refused.value)
-
-
-def test_absurd_segregation_is_refused_too(monkeypatch):
-    scene = mixed(
-        {"resolution.points": sized(16, 6), "resolution.cells": 2, "exchange.segregation": 100, "exchange.mixing": 0}
-    )
-    needed = int(simulate(scene)["exchange_substeps"])
-    assert needed > 20
-    monkeypatch.setattr(lattice, "MOST_SUBSTEPS", needed // 2)
-    with pytest.raises(
-        ValueError, match=rf"exchange: got segregation 100 .* substeps .* at most {needed // 2:,}; predicted"
-    ):
-        simulate(scene)
 
 
 def test_the_last_number_of_passes_that_is_not_refused():
@@ -498,12 +475,6 @@ def test_guard_keeps_swaps_from_overshooting(chance, monkeypatch):
     assert np.allclose(free, 0.5 + (1 - 2 * chance) ** np.arange(1, 5) / 2, atol=noise)
     if chance >= 0.8:
         assert np.array_equal(np.sign(free[:3] - 0.5), [-1, 1, -1])
-
-
-def test_guard_counts_every_edge_of_a_cell():
-    """A cell with four edges of 0.3 would swap 1.2 times a step: three substeps, though no edge is above 1/2."""
-    star = SwapRates(np.array([[0, k] for k in range(1, 5)]), np.zeros(4), np.full(4, 0.3), np.zeros(4))
-    assert lattice.substeps_needed(star, star.mixing, np.full(5, 0.02), 0.06).tolist() == [3] * 4
 
 
 # --- diffusion against the error function ------------------------------------------------------------------

@@ -287,15 +287,6 @@ def test_files_without_a_sweep_are_refused(refused, tmp_path):
     assert "lost.nc: no case holds a result, so there is nothing to show; the first: refused: gap 1200" in message
 
 
-def test_a_file_with_values_elsewhere_is_refused_unread(refused, tmp_path):
-    import h5py
-
-    (tmp_path / "secret").write_bytes(bytes(64))
-    with h5py.File(tmp_path / "sly.nc", "w") as file:
-        file.create_dataset("status", (8,), "f8", external=[(str(tmp_path / "secret"), 0, 64)])
-    assert "/status has its values in other files" in refused("sly.nc")
-
-
 def test_bad_options_are_refused(refused, tmp_path, monkeypatch):
     netcdf.write_dataset(swept("one"), tmp_path / "one.nc")
     assert "--sieve: got '1'; text without a unit" in refused("one.nc", "--sieve", "1")

@@ -119,13 +119,6 @@ def test_draw_order_is_random_and_follows_the_source():
     assert abs(np.corrcoef(first[1:], first[:-1])[0, 1]) * math.sqrt(1000) < 5
 
 
-@each
-def test_drawn_sizes_lie_within_the_feed(given_feed):
-    drawn = draw(given_feed, 1000, np.random.SeedSequence(3))
-    assert np.all(drawn > 0)
-    assert np.all(drawn <= np.float32(given_feed.largest_grain))
-
-
 @pytest.mark.parametrize(
     "given_feed",
     [

@@ -116,12 +116,6 @@ def test_examples_of_units_are_read():
     assert all(parse(entry.example, unit) > 0 for unit, entry in UNITS.items())
 
 
-@pytest.mark.parametrize("value", [-1, 1.0, 1.5, True, 2**63, "0", None])
-def test_seeds_are_whole_numbers_that_a_file_can_hold(value):
-    with pytest.raises(ValueError, match=r"seed: got .*; must be a whole number from 0 to"):
-        check_number("seed", value)
-
-
 def test_good_seeds_pass():
     for value in (0, 2**63 - 1):
         check_number("seed", value)

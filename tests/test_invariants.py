@@ -14,10 +14,9 @@ from hypothesis import strategies as st
 from support import paper, sized
 
 from hpgr import simulate
-from hpgr.bed import machine
 from hpgr.fields import values_of
 from hpgr.results.flags import BITS
-from hpgr.scene import Scene, field_info
+from hpgr.scene import field_info
 from studies.guard import judge, ranges
 from studies.guard.invariants import INVARIANTS, violations
 
@@ -282,16 +281,3 @@ def test_vanishing_cushioning_is_none(exchange):
         first, second = simulate(scene), simulate(scene.with_values({"strength.cushioning": 1e150}))
         for name in first.variables:
             assert np.array_equal(first[name], second[name]), name
-
-
-def test_the_floating_gap_carries_its_force():
-    """To 1e-6, or it is refused; and the scene that comes back is one that is accepted, and carries it itself."""
-    judged = 0
-    for scene in drawn(sized(100, 30), **{"resolution.cells": 0}):
-        wanted = scene.rolls.specific_pressing_force
-        if wanted is not None:
-            floated = machine.float_gap(scene)
-            assert machine.specific_pressing_force(floated) == pytest.approx(wanted, rel=1e-6)
-            assert Scene.model_validate_json(floated.model_dump_json()) == floated
-            judged += 1
-    assert judged > sized(5, 0)

@@ -302,49 +302,7 @@ def test_a15_dust_shields_a_coarse_grain_by_at_most_its_factor(n):
     assert march(sizes, streams(5), [bound * (1 - 1e-6)], n=n)[2] == 0
 
 
-@given(st.lists(st.floats(1e-5, 1.0), min_size=1, max_size=30), st.sampled_from([0.3, 1.0, 3.0]))
-def test_a15_a_coarsest_grain_never_withstands_more(sizes, n):
-    sizes = np.array(sizes, np.float32)
-    coarsest = sizes.argmax()
-    bound = critical_log_stress(float(sizes[coarsest])) + math.log(3) ** 2 / (2 * n**2)
-    _, after, _ = march(sizes, streams(sizes.size), [bound + 1e-9], n=n)
-    assert after[coarsest] != streams(sizes.size)[coarsest]
-
-
 # --- bit-exact relations -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("n", [0.5, INF])
-def test_sizes_times_4_with_their_scale_give_sizes_times_4(n):
-    sizes, states = line(200, seed=31)
-    for history in histories(40, seed=31).values():
-        small = march(sizes, states, history, n=n)
-        large = march(4 * sizes, states, history, n=n, reference_size=4 * 0.06, floor=4e-6)
-        assert np.array_equal(large[0], 4 * small[0])
-        assert np.array_equal(large[1], small[1])
-
-
-@given(st.integers(1, 60), st.integers(0, 60), st.sampled_from([0.3, 1.0, INF]), st.integers(0, 5))
-def test_rotating_and_mirroring_the_line_with_its_streams(cells, shift, n, seed):
-    sizes, states = line(cells, seed=seed)
-    history = histories(20, seed=seed)["wandering"]
-    straight = march(sizes, states, history, n=n)
-    rolled = march(np.roll(sizes, shift), np.roll(states, shift), history, n=n)
-    flipped = march(sizes[::-1], states[::-1], history, n=n)
-    for k in range(2):
-        assert np.array_equal(rolled[k], np.roll(straight[k], shift))
-        assert np.array_equal(flipped[k], straight[k][::-1])
-
-
-def test_history_may_be_cut_anywhere():
-    """The bounds that cells carry between steps decide nothing."""
-    sizes, states = line(200, seed=32)
-    for history in histories(40, seed=32).values():
-        whole = march(sizes, states, history)
-        first = march(sizes, states, history[:17])
-        second = march(first[0], first[1], history[17:])
-        assert np.array_equal(second[0], whole[0])
-        assert first[2] + second[2] == whole[2]
 
 
 # --- what holds always -------------------------------------------------------------------------------------
@@ -365,16 +323,6 @@ def test_hundreds_of_breaks_end_at_the_smallest_size():
     found, _, breaks = march(sizes, states, [200.0] * 400, w=INF, n=INF, floor=0.0)
     assert breaks == 20 * 400
     assert np.all(found == np.float32(kernels.SMALLEST))
-
-
-@pytest.mark.parametrize("w", [3.04, 300.0, 1e4, INF])
-def test_nothing_below_the_floor_breaks(w):
-    sizes, states = line(100, seed=43)
-    floor = 1e-3
-    *_, snapshots, _ = march(sizes, states, [30.0] * 60, w=w, n=INF, floor=floor, every=True)
-    below = snapshots[:-1] < floor
-    assert np.array_equal(snapshots[1:][below], snapshots[:-1][below])
-    assert below[-1].all()
 
 
 def test_no_stress_breaks_nothing():

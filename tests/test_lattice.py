@@ -596,23 +596,6 @@ def test_reduced_lattice_begins_above_the_first_break():
 # --- memory ------------------------------------------------------------------------------------------------
 
 
-def test_predicted_memory_of_the_lattice_is_that_of_its_arrays():
-    """Within a factor of 2, from what the prediction adds per cell to what the arrays add per cell."""
-    few, many = (mixed({"resolution.cells": cells, "resolution.record": "distributions"}) for cells in (16, 4016))
-
-    def held(scene):
-        machine = lattice(scene)
-        parts = [*machine.parcels, *machine._shares, *vars(machine).values()]
-        return sum(part.nbytes for part in parts if isinstance(part, np.ndarray))
-
-    predicted = cost.predict(many).bytes - cost.predict(few).bytes
-    allocated = held(many) - held(few)
-    assert allocated > 15 * 4000 * 3 * many.resolution.points
-    assert 0.5 < predicted / allocated < 2
-    assert cost.predict(many).bytes > held(many)
-    assert cost.predict(small()).bytes < cost.predict(mixed()).bytes
-
-
 def test_predicted_memory_counts_the_start_up_snapshots():
     for record, part in (("cells", "size"), ("distributions", "mass_fraction")):
         scene = mixed({"exchange.record_startup": True, "exchange.interval": 1, "resolution.record": record})

@@ -124,12 +124,6 @@ def test_bounds_of_percentiles(cells):
     assert np.array_equal(percentile_size(cells, 0), sizes.min(axis=1))
 
 
-def test_impossible_percentiles_are_refused(product):
-    for percent in (-1, 100.5, float("nan")):
-        with pytest.raises(ValueError, match=r"percent: got .* must be within 0 to 100"):
-            percentile_size(product, percent)
-
-
 def test_what_was_not_recorded_is_refused_with_the_remedy(product):
     with pytest.raises(ValueError, match=r"point: got 3; only the exit .* 'distributions' or 'cells'"):
         passing(product, point=3)
@@ -213,9 +207,3 @@ def test_points_beyond_the_bed_are_refused():
         with pytest.raises(ValueError, match=rf"point: got {point}; must be within -41 to 40"):
             passing(ds, point=point)
     assert passing(ds, point=-41).identical(passing(ds, point=0))
-
-
-def test_feed_of_a_foreign_file_opens_nothing(product, tmp_path):
-    told = product.attrs["scene"].replace('"feed":{', f'"feed":{{"kind":"table","table":"{tmp_path}/secret","x":0,', 1)
-    with pytest.raises(ValueError, match=r"feed\.table: got the name of a file; a result holds the table itself"):
-        reduction_ratio(product.assign_attrs(scene=told))

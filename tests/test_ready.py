@@ -49,13 +49,6 @@ def test_readme_has_two_commands():
     assert "[test]" in set_up[1]
 
 
-def test_readme_pictures_exist():
-    names = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text("README.md"))
-    assert names
-    for name in names:
-        assert (ROOT / name).read_bytes().startswith(b"\x89PNG")
-
-
 def test_readme_code_runs(tmp_path, monkeypatch, capsys):
     """The scene and the Python of the README, in one folder and a coarse resolution."""
     [scene], codes = blocks("toml"), blocks("python")

@@ -170,13 +170,6 @@ def test_change_is_that_of_pairs(result):
     ]
 
 
-def test_axes_of_text():
-    axis = xr.DataArray(["a"], dims="integrator", name="elasticity_integrator", attrs={"units": "1"})
-    assert report.axis_label(axis) == "elasticity integrator"
-    assert report.shown_values(axis).tolist() == ["a"]
-    assert report.value_text(axis, "a") == "a"
-
-
 def test_a_value_meant_in_another_unit_is_told_before_the_limits():
     """A bare 20 in a scene file is 191 rpm; the table alone does not show it."""
     base = paper({"resolution.cells": 0, "resolution.points": 30, "rolls.speed": 20})

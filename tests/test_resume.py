@@ -41,15 +41,6 @@ def counted(monkeypatch):
     return seen
 
 
-def test_finished_cases_are_not_computed_again(base, client, tmp_path, counted):
-    without = sweep(base, {"rolls.gap": GAPS}, 2, client=client)
-    for computed in (6, 0):
-        counted.clear()
-        found = sweep(base, {"rolls.gap": GAPS}, 2, client=client, folder=tmp_path)
-        assert len(counted) == computed
-        xr.testing.assert_identical(found, without)
-
-
 def test_extending_and_reordering_compute_what_is_new_only(base, client, tmp_path, counted):
     old = sweep(base, {"rolls.gap": GAPS}, 2, client=client, folder=tmp_path)
     counted.clear()

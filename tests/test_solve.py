@@ -50,18 +50,6 @@ def test_only_compacting_points_crush():
     assert solve.crushing_stress(paper(), bed).tolist() == [[5e6, 0.0, 5e6]]
 
 
-def test_closed_form_draws_no_cells(monkeypatch):
-    def refuse(*args, **kwargs):
-        raise AssertionError("cell work")
-
-    monkeypatch.setattr(kernels, "crush", refuse)
-    monkeypatch.setattr(kernels, "start_parcels", refuse)
-    scene = paper({"strength.cushioning": INF, "resolution.record": "product"})
-    assert simulate(scene)["p80_total"] > 0
-    with pytest.raises(AssertionError, match="cell work"):
-        simulate(paper())
-
-
 @pytest.mark.parametrize("gamma", [0.35, 1.0])
 def test_closed_form_is_the_limit_of_the_march(gamma):
     """KS at 1e-6 on every sieve, plus 0.5 % for grains that the last steps before the peak leave unfinished."""
@@ -121,14 +109,6 @@ def test_streamlines_under_the_same_stress_are_independent():
     for first, second in ((0, 1), (0, 2), (1, 2)):
         assert abs(np.corrcoef(product[first], product[second])[0, 1]) * math.sqrt(cells) < 5
         assert np.intersect1d(product[first], product[second]).size < 5
-
-
-def test_a_snapshot_does_not_depend_on_the_others():
-    scene = paper({"resolution.snapshots": 3})
-    history = load(scene)
-    three = crush(scene, history, 3, 1).size
-    one = crush(paper(), history, 3, 1).size
-    assert np.array_equal(three[:1], one)
 
 
 def test_keys_tell_every_parcel_apart():

@@ -247,18 +247,6 @@ def test_peak_pressures_of_the_papers_machine(c, peaks):
     assert state.pressure.max(axis=1)[[0, 4, 9]] / 1e6 == pytest.approx(peaks, rel=1e-3)
 
 
-def test_pressure_rises_sharply_with_depth_and_is_larger_at_mid_gap():
-    """The paper's shape: most of the pressure comes in the lowest part, and falls from mid-gap to roll."""
-    bed = load_bed(inputs_of(paper())._replace(points=801, streamlines=10))
-    assert np.all(np.diff(bed.stress.pressure.max(axis=1)) < 0)
-    for pressure, y in zip(bed.stress.pressure, bed.kinematics.y, strict=True):
-        peak = pressure.argmax()
-        assert np.all(np.diff(pressure[: peak + 1]) >= 0)
-        assert y[peak] < 0.05 * y[0]
-        half_way = np.interp(0.5 * pressure[peak], pressure[: peak + 1], y[: peak + 1])
-        assert half_way < 0.35 * y[0]  # half of the rise within the lowest third of the bed
-
-
 def test_a_tiny_shear_limit_is_kept_to_the_last_bit():
     """The plain sum of shear is ten million times the limit, and loses as many digits of it."""
     soft = {"elasticity.bulk_modulus": 1.0, "elasticity.shear_modulus": 1e12, "elasticity.exponent": 9.9}

@@ -159,18 +159,12 @@ def test_no_axes_and_no_cells(base, client):
 @pytest.mark.parametrize(
     ("axes", "words"),
     [
-        ({"rolls.gap": [0.04, "40 mm"]}, ["rolls.gap", "0.04", "twice", "replicates"]),
         ({"rolls.gap": []}, ["rolls.gap", "no values"]),
         ({"rolls.gap": "40 mm"}, ["rolls.gap", "a list of values"]),
-        ({"rolls.gaps": [0.04]}, ["rolls.gaps", "did you mean", "rolls.gap"]),
         ({"rolls.gap": ["40"]}, ["rolls.gap", "without a unit", "40 mm"]),
-        ({"rolls.gap": [float("nan")]}, ["rolls.gap", "NaN"]),
         ({"rolls.gap": [-0.04]}, ["rolls.gap", "-40 mm", "at least"]),
-        ({"resolution.cells": [10.5]}, ["resolution.cells", "10.5", "whole number"]),
-        ({"elasticity.integrator": ["runge"]}, ["elasticity.integrator", "'runge'", "'euler'"]),
         # a coordinate holds one number or text per label
         ({"resolution.sieves": [(0.001, 1.0), (0.002, 1.0)]}, ["resolution.sieves", "no lists"]),
-        ({"feed.table": [((0.001, 0.0), (0.05, 100.0))]}, ["feed.table", "no lists"]),
         ({"rolls.gap": [0.04], "rolls.specific_pressing_force": [3e6]}, ["rolls.gap", "floats", "one of them"]),
     ],
 )
@@ -185,12 +179,8 @@ def test_bad_axes_are_refused_before_anything_runs(base, monkeypatch, axes, word
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"replicates": 0}, "replicates: got 0; must be a whole number from 1 to 1,000,000"),
-        ({"replicates": 1.5}, "replicates: got 1.5; must be a whole number from 1"),
         ({"threads": 0}, "threads: got 0"),
         ({"seed": -1}, "seed: got -1"),
-        ({"timeout": 0}, "timeout: got 0"),
-        ({"timeout": float("nan")}, "timeout: got nan"),
         ({"record": "cells"}, "folder: got None; record='cells'"),
     ],
 )
