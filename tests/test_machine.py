@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.integrate import cumulative_simpson, simpson
 from support import paper, plain_industrial, plain_pilot
 
-from hpgr import Scene, operating_gap, simulate
+from hpgr import Scene, operating_gap, presets, simulate
 from hpgr.bed import machine
 from hpgr.bed.loaded import Beds, Pressed, bear, inputs_of, load_bed
 from hpgr.laws.flow import NipFlow, PowerFlow
@@ -410,6 +410,23 @@ def test_recovery_adds_force_and_gives_back_power():
     assert recovering.pressing_force - bare.pressing_force == pytest.approx(force, rel=1e-4)
     given_back = inputs.gap * inputs.surface_speed * energy * width
     assert bare.power - recovering.power == pytest.approx(given_back, rel=1e-4)
+
+
+def test_a_cake_that_would_give_back_more_than_was_put_in_is_told():
+    narrow, usual = (
+        simulate(presets.industrial().with_values(SMALL | {"rolls.gap": gap})) for gap in ("48 mm", "60 mm")
+    )
+    assert float(narrow["power"]) == 0
+    assert "recovery_held" in narrow.attrs["diagnostics"]
+    assert "recovery_held" not in usual.attrs["diagnostics"]
+
+
+@pytest.mark.parametrize("points", [40, 57, 150])
+def test_nip_angle_of_gradual_compaction_does_not_jump_with_the_points(points):
+    fine, coarse = (
+        float(simulate(paper({"resolution.points": n, "resolution.cells": 0})).nip_angle) for n in (3201, points)
+    )
+    assert coarse == pytest.approx(fine, rel=1e-3)  # once the point past the onset, up to 5 % too low
 
 
 def test_force_and_power_over_a_friction_hill_are_means_over_the_width_at_every_height():

@@ -153,10 +153,16 @@ def _power(inputs: BedInputs, geometry: Geometry, motion: Kinematics, strains: S
 
 
 def _press(inputs: BedInputs, geometry: Geometry, motion: Kinematics, strains: StepStrains, state: StressState):
-    first = int((motion.volumetric_rate[-1] > 0).argmax())
-    onset = inputs.profile().nip_angle or math.asin(motion.y[-1, first] / geometry.radius)
+    onset = inputs.profile().nip_angle or math.asin(_onset(motion) / geometry.radius)
     force, power = force_on_roll(inputs, geometry, motion, state), _power(inputs, geometry, motion, strains, state)
     return Pressed(force, power, onset if (strains.volumetric[-1] > 0).any() else 0.0)
+
+
+def _onset(motion: Kinematics) -> float:
+    """Return the height at which the roll's streamline begins to compact, m, the rate linear between two points."""
+    rate, y = motion.volumetric_rate[-1], motion.y[-1]
+    first = int((rate > 0).argmax())
+    return float(np.interp(0.0, rate[first - 1 : first + 1], y[first - 1 : first + 1]) if first else y[0])
 
 
 def _tessellated(inputs: BedInputs, bed: LoadedBed) -> "Tessellation":

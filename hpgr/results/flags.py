@@ -167,6 +167,11 @@ def _no_force_angle(run: Run) -> bool:
     return run.performance.force_angle >= np.pi / 2
 
 
+def _recovery_held(run: Run) -> bool:
+    recovers = run.scene.elasticity.recovery_modulus is not None
+    return recovers and run.performance.force_angle == 0 < run.performance.pressing_force
+
+
 def _few_cells(run: Run) -> bool:
     return run.scene.resolution.cells in (2, 3)
 
@@ -210,6 +215,7 @@ FLAGS = (  # in the order in which they are told
     Flag("tension_clamped", 64, "tension or reverse shear was held at 0", lambda run: run.bed.stress.tension_clamped),
     Flag("no_limit_of_steps", 512, "stresses need not converge as time steps shrink", _no_limit_of_steps),
     Flag("no_force_angle", 256, "more power than the force can give at any angle", _no_force_angle),
+    Flag("recovery_held", 4096, "the cake gives back no more than was put in: no net power", _recovery_held),
     Flag("no_breakage", 1, "no grain broke: the product is the feed", lambda run: run.broken is False),
     Flag("feed_below_critical", 1024, "part of the feed is finer than any stress breaks", _feed_below_critical),
     Flag("fragment_exponent_held", 2048, "the exponent of fragments left its range", _fragment_exponent_held),
