@@ -2,6 +2,7 @@
 
 import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from hpgr.grains.solve import choose, is_controlled
 from hpgr.scene import Scene
 
 _SHARE = 0.8  # of the available memory that one scene may take; the rest is for the reader of the result
-_SLIGHT = 10_000_000  # bytes, a tenth of what the libraries have taken; asking for more takes 15 % of a simulation
+_SLIGHT = 10_000_000  # bytes, a tenth of what the libraries have taken; asking for more takes 0.6 ms
 _NO_LIMIT = 2**60  # bytes; version 1 writes "no limit" as a number near 2**63
 _PROCESS = Path("/proc/self/cgroup")  # where the system tells the control groups of this process
 _CGROUPS = (  # of version 1 (its memory controller), version 2, and version 2 beside version 1
@@ -121,15 +122,15 @@ def _cached(group: Path, name: str) -> int:
         return 0
 
 
-def refuse_too_large(scene: Scene, room: tuple[int, str] | None = None) -> None:
+def refuse_too_large(scene: Scene, room: Callable[[], tuple[int, str]] | None = None) -> None:
     """Raise MemoryError with the predicted bytes if `scene` does not fit this machine.
 
-    `room` is what `available_memory` returned before; by default the system is asked, if the scene takes much.
+    Of a scene that takes much, `room` tells what memory there is, as `available_memory`, its default, does.
     """
     needed = predict(scene).bytes
-    if room is None and needed < _SLIGHT:
+    if needed < _SLIGHT:
         return
-    available, limit = room or available_memory()
+    available, limit = (room or available_memory)()
     if needed > _SHARE * available:
         spare = "" if scene.resolution.record == "product" else "record 'product', or "
         raise MemoryError(

@@ -148,11 +148,12 @@ def march(
         slots = np.arange(parcels.breaks.size)
         passage = Passage(slots, lines[part], 0 * slots, 0 * slots + points)
         own = Record(record.sieves, *(None if kept is None else kept[part] for kept in record[1:]))
-        kernels.crush(parcels, passage, loads, laws, kernels.make_work(grid.cells), own)
+        work = kernels.make_work(grid.cells)
+        kernels.crush(parcels, passage, loads, laws, work, own)
         product[part], breaks[part] = parcels.sizes[:, 1:-1], parcels.breaks
         if ends is not None:
             critical = loads.critical_ratio.min(axis=1)[lines[part]]
-            kernels.complete(*parcels[:3], critical, laws.inverse_exponent, laws)
+            kernels.complete(*parcels[:3], critical, laws.inverse_exponent, laws, work.places)
             ends[part] = parcels.sizes[:, 1:-1]
 
     step = max(AT_ONCE // grid.cells, 1)

@@ -75,6 +75,7 @@ def diagnose(
         run = Run(scene, bed, performance, broken, 0.0)
         return {flag.name: flag.hit(run) for flag in FLAGS if not flag.own}
 
+    @cache
     def found(broken: bool | None, below_floor: float) -> dict[str, str]:
         run, known = Run(scene, bed, performance, broken, below_floor), shared(broken)
         hits = ((flag, flag.hit(run) if flag.own else known[flag.name]) for flag in FLAGS)

@@ -90,7 +90,7 @@ def _run(scene: Scene, seed: int) -> Outcome:
             warnings.simplefilter("error")
             # without the compiler NumPy speaks up when a 64-bit stream wraps, which is what it is there for
             warnings.filterwarnings("ignore", "overflow encountered in scalar", RuntimeWarning, r"hpgr\.grains")
-            cost.refuse_too_large(scene, (ROOM, "this study's own limit"))
+            cost.refuse_too_large(scene, lambda: (ROOM, "this study's own limit"))
             result = hpgr.simulate(scene, seed)
     except ValidationError as error:
         return Outcome("fault", message=_crash(error))
