@@ -169,11 +169,6 @@ def levels() -> dict[str, Level]:
         return {name: Level(**level) for name, level in tomllib.load(file).items()}
 
 
-def _default_sieves() -> tuple[float, ...]:
-    """Return 1 um to 1 m in the R10 series (ten sieves a decade, ISO 3)."""
-    return tuple(float(f"{10 ** (k / 10 - 6):.6g}") for k in range(61))
-
-
 class Resolution(Frozen):
     """How finely the scene is computed, and what is kept of it.
 
@@ -203,7 +198,7 @@ class Resolution(Frozen):
     the mean is known; what is recorded of the cells themselves is never corrected.
     """
     sieves: tuple[Metres, ...] = quantity(
-        _default_sieves(),
+        tuple(float(f"{10 ** (k / 10 - 6):.6g}") for k in range(61)),
         symbol="s_k",
         unit="m",
         source="ours (R10 series, 1 um to 1 m)",
@@ -316,7 +311,9 @@ class Scene(Frozen):
         path = path_of("path", path)
         text, kind = tables.text_of(path), "JSON" if path.suffix == ".json" else "TOML"
         try:
-            data = _shallow(json.loads(text) if kind == "JSON" else tomllib.loads(_without_long_keys(text)))
+            if kind == "TOML" and _LONG_KEY.search(text):  # reading those takes memory by the square of their parts
+                raise RecursionError
+            data = _shallow(json.loads(text) if kind == "JSON" else tomllib.loads(text))
         except RecursionError:
             raise ValueError(f"{path}: nested too deep; a scene has sections of fields; see the README") from None
         except ValueError as error:
@@ -418,13 +415,6 @@ def _shallow(data: Any) -> Any:
     if any(isinstance(each, dict | list) for each in level):
         raise RecursionError
     return data
-
-
-def _without_long_keys(text: str) -> str:
-    """Return the text of a TOML file, refusing keys of so many parts that reading them takes memory by their square."""
-    if _LONG_KEY.search(text):
-        raise RecursionError
-    return text
 
 
 def _dotted(data: Mapping[str, Any]) -> dict[str, Any]:

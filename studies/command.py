@@ -140,7 +140,7 @@ def _named_scene(name: str) -> Scene:
         raise ValueError(f"--scene: cannot read {name!r}: {error.strerror}") from None
 
 
-def quantity_of(option: str, text: str, unit: str) -> float:
+def si_value(option: str, text: str, unit: str) -> float:
     """Return the SI value of an option's text, such as "1 mm"; a ValueError names the option."""
     try:
         return parse(text, unit)

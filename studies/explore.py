@@ -37,7 +37,7 @@ def _files(options: Options) -> list[Path]:
 @cli.command("explore", __doc__, files=_files)
 def main(options: Options) -> cli.Report:
     """Write the page of the command line."""
-    sieve = cli.quantity_of("--sieve", options.sieve, "m")
+    sieve = cli.si_value("--sieve", options.sieve, "m")
     library = chart_library()
     from studies.show.page import page_data, page_of
 

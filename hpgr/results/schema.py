@@ -188,7 +188,9 @@ def to_dataset(values: Mapping[str, Any], attrs: Mapping[str, Any], own: Mapping
     data = [name for name in given if name not in COORDINATES and name not in table[name].dims]
     made = {}
     for name in [*data, *(name for name in given if name not in data)]:
-        row, stored = table[name], _stored(given[name], table[name].dtype)
+        row, value = table[name], given[name]
+        lazy = hasattr(value, "__dask_graph__")  # and stays so
+        stored = value.astype(row.dtype or value.dtype) if lazy else np.asarray(value, row.dtype)
         # neither asks xarray whether the values are of dask or pint, whose import was 0.4 s of the first simulation
         if row.dims == (name,) and stored.dtype.kind in "if":
             made[name] = xr.Variable(row.dims, pd.Index(stored), row.attributes())
@@ -198,8 +200,3 @@ def to_dataset(values: Mapping[str, Any], attrs: Mapping[str, Any], own: Mapping
     found = xr.Coordinates(made).to_dataset().reset_coords(data)
     found.attrs.update(attrs)
     return found
-
-
-def _stored(value: Any, dtype: type | None) -> Any:
-    """Return `value` as an array of its storage type; one of dask stays lazy."""
-    return value.astype(dtype or value.dtype) if hasattr(value, "__dask_graph__") else np.asarray(value, dtype)

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from hpgr.fields import unit_shown
-from studies.command import quantity_of
+from studies.command import si_value
 from studies.show import report
 
 if TYPE_CHECKING:
@@ -46,11 +46,11 @@ class Plant:
 
     def table(self, sieve: str = "1 mm") -> str:
         """Return the table of a sweep, a line for each operating point, as its command prints it."""
-        return report.table(self._sweep(), quantity_of("sieve", sieve, "m"))
+        return report.table(self._sweep(), si_value("sieve", sieve, "m"))
 
     def plot(self, sieve: str = "1 mm") -> "Figure":
         """Return the figure of a sweep, as its command draws it."""
-        result, size = self._sweep(), quantity_of("sieve", sieve, "m")
+        result, size = self._sweep(), si_value("sieve", sieve, "m")
         field = result.attrs["axes"].partition(",")[0]
         if not field:
             raise ValueError("dataset: got a sweep of no axis; must have one to be drawn; such as {'gap': ['40 mm']}")

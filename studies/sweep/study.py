@@ -238,7 +238,7 @@ def _carried(factors: tuple[float, ...], scenes: list[Scene]) -> tuple[float, ..
 
 def _sieve(options: Options, scene: Scene) -> float:
     known = scene.resolution.sieves
-    sieve = line.quantity_of("--sieve", options.sieve, "m")
+    sieve = line.si_value("--sieve", options.sieve, "m")
     if not known[0] <= sieve <= known[-1]:
         raise ValueError(
             f"--sieve: got {options.sieve!r}; must lie within the scene's sieves, "
