@@ -82,7 +82,7 @@ def crushing():
             }
             old, new = scenes(size, old_size)
             log_stress = new.strength.log_stress(solve.crushing_stress(new, load_bed(inputs_of(new))))
-            path, ore = march.path(new, log_stress), march.ore(new)._replace(cushion=0.5 / n**2)
+            path, ore = march.path(new, log_stress), march.ore(new.with_values({"strength.cushioning": n}))
             with BEFORE:
                 needed, constants = parcels.reach_needed(old, log_stress), list(parcels.constants(old))
             constants[1] = 0.5 / n**2

@@ -31,6 +31,21 @@ def test_cushioning_only_strengthens_and_by_a_bounded_factor_among_finer_grains(
     assert cushioned[largest] <= plain[largest] + math.log(3) ** 2 / (2 * cushioning**2) + 1e-9
 
 
+@pytest.mark.parametrize("n", [1e-6, 1e-3, 0.1, 0.5, 1.0, 30.0, INF])
+def test_polynomial_of_cushioning_is_as_wrong_as_it_says(n):
+    law = Strength(cushioning=n)
+    mean, size = np.float32(0.01), np.geomspace(0.0034, 0.03, 5000, dtype=np.float32)
+    size = np.concatenate([size, mean * np.float32(1 + 1e-6 * np.linspace(-1, 1, 50))])
+    constants = law.constants()
+    *terms, wrong = constants.cushioned
+    assert wrong < (1e-5 if n >= 0.5 else 1e9)
+    z = (size - mean) / (size + mean)
+    found = np.polynomial.polynomial.polyval(z * z, terms)
+    assert found.dtype == np.float32
+    exact = np.exp(-constants.cushion / constants.scale * np.log(size.astype(float) / float(mean)) ** 2)
+    assert np.all(abs(found - exact) <= wrong)
+
+
 @pytest.mark.parametrize("w", [1.0, 3.04, 30.0])
 def test_critical_size_is_where_strength_meets_stress(w):
     law = Strength(weibull_modulus=w, cushioning=INF)
