@@ -74,6 +74,24 @@ def test_unknown_names_are_refused_none_is_left_out_and_values_are_cast_to_their
     assert made.attrs == {"a": 1}
 
 
+def test_datasets_of_equal_names_and_shapes_share_nothing_that_can_be_written_to():
+    def made():
+        return schema.to_dataset({"p50": np.arange(3.0), "x": np.ones((3, 2)), "sieve": [1.0, 2.0], "power": 5.0}, {})
+
+    spoilt, wanted = made(), made().copy(deep=True)
+    assert list(spoilt.coords) == ["x", "sieve"]
+    for variable in spoilt.variables.values():
+        if variable.values.flags.writeable:
+            variable.values[...] = -1
+        variable.attrs.clear()
+        variable.encoding["dtype"] = "int8"
+    assert spoilt["p50"].values.tolist() == [-1, -1, -1]
+    spoilt.attrs["a"] = 1
+    del spoilt["power"]
+    assert made().identical(wanted)
+    assert made()["p50"].encoding == {}
+
+
 def test_axes_and_datasets_have_their_attributes_from_here():
     axis = schema.field_axis("rolls.gap", "gap")
     assert axis.dims == ("gap",)
