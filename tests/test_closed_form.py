@@ -123,8 +123,7 @@ def test_cascade_has_the_papers_law_as_its_limit(feed):
     found = np.array([np.interp(np.log(sizes), edges, cumulative[:, line]) for line in range(2)]).T
     apart = np.abs(np.log(sizes[:, None] / critical)) > edges[1] - edges[0]  # not within the class of s_c
     assert np.abs(found - exact)[apart].max() < 3e-4
-    # of one size all the feed is at the top of its class, not spread over it: breaks miss gamma times half its width
-    assert breaks == pytest.approx(expected_breaks(feed, critical, 0.35), abs=6e-3)
+    assert breaks == pytest.approx(expected_breaks(feed, critical, 0.35), abs=3e-3)
     sharp = crushed(feed, laws(k=100.0).strength, law.fragments, critical)[0](size=sizes[:, None])
     assert np.abs(sharp - exact).max() < 0.02
 
@@ -144,8 +143,18 @@ def test_cascade_holds_all_of_a_feed_of_one_size(size):
     """exp(log(size)) may be less than the size, which no grain of the feed passes: the product was then the feed."""
     law = laws(gamma=0.4, nu=1e-12)
     passing, breaks = crushed(SingleFeed(size=size), law.strength, law.fragments, np.array([size / 10]))
-    assert float(breaks()[0]) == pytest.approx(1 + 0.4 * math.log(10), abs=8e-3)
+    assert float(breaks()[0]) == pytest.approx(1 + 0.4 * math.log(10), abs=1e-3)
     assert float(passing(size=np.array([size / 100]))[0]) == pytest.approx(0.1**0.4, rel=1e-2)
+
+
+@pytest.mark.parametrize("k", [2.0, 20.0])
+def test_cascade_breaks_one_size_by_its_own_chance(k):
+    """What is never broken is 1 - B(s0): once B of the middle of the size's class, 1.7 % finer."""
+    law, size, critical = laws(k=k, gamma=0.05), 0.04, np.array([0.035, 0.04, 0.05])
+    passing, breaks = crushed(SingleFeed(size=size), law.strength, law.fragments, critical)
+    broken = -np.expm1(-((size / critical) ** (3 * k / law.strength.weibull_modulus)))
+    assert passing(size=np.full(3, 0.93 * size)) == pytest.approx(broken, abs=5e-3)  # few fragments are as coarse
+    assert np.all(breaks() > broken)
 
 
 def test_scattered_strengths_under_a_stress_that_breaks_finer_grains_than_the_floor():

@@ -13,7 +13,7 @@ from functools import cache, partial
 import numpy as np
 
 from hpgr.grains import kernels
-from hpgr.laws.feed import Feed
+from hpgr.laws.feed import Feed, SingleFeed
 from hpgr.laws.fragments import Fragments
 from hpgr.laws.strength import Strength
 
@@ -63,13 +63,17 @@ def _cascade(feed: Feed, strength: Strength, fragments: Fragments, critical: np.
     within = -np.expm1(-kept) / kept
     leaving = np.pad(chance * within, ((1, 0), (0, 0)))
     sizes = np.append(np.exp(edges[:-1]), feed.largest_grain)  # exp(log(s)) may be less than s, which no grain passes
-    feed_mass = np.diff(feed.passing(sizes), prepend=0.0)
-    ever = np.repeat(feed_mass[:, None], critical.size, axis=1)
+    feed_passing, first = np.repeat(feed.passing(sizes)[:, None], critical.size, axis=1), 0.0
+    if isinstance(feed, SingleFeed):  # no class: its chance is its own, and what is left of it passes the last edge
+        broken = top >= np.log(critical) if math.isinf(strength.scatter) else strength.chance(sizes[-1], critical)
+        first = np.where(sizes[-1] < fragments.size_floor, 0.0, broken)
+        feed_passing = first * (sizes[:, None] / sizes[-1]) ** fragments.exponent_of(sizes[-1])
+    ever = np.diff(feed_passing, prepend=0.0, axis=0)
     kernels.cascade(ever, leaving, np.pad(np.exp(-gamma[:, 0] * width), (1, 0)))
     tries = chance * (1 + chance * (1 - within) / np.maximum(1 - chance, 1e-9 / (gamma * width)))
     cumulative = np.minimum(np.cumsum(ever * (1 - leaving), axis=0), 1.0)
     cumulative[-1] = 1.0  # but for rounding
-    return edges, cumulative, np.sum(ever[1:] * tries, axis=0)
+    return edges, cumulative, first + np.sum(ever[1:] * tries, axis=0)
 
 
 def _between(edges: np.ndarray, cumulative: np.ndarray, size) -> np.ndarray:
