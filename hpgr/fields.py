@@ -253,6 +253,13 @@ class Frozen(BaseModel):
         return model
 
     @classmethod
+    def __get_pydantic_json_schema__(cls, core: Any, handler: Any) -> dict[str, Any]:
+        found = handler.resolve_ref_schema(handler(core))
+        for name, text in meanings(cls).items():
+            found["properties"][name]["description"] = text
+        return found
+
+    @classmethod
     def _impossible(cls, known: dict[str, Any]) -> Iterator[Fault]:
         """Yield the faults of combinations, judged on the values that are valid alone."""
         yield from ()

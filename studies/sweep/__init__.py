@@ -72,7 +72,7 @@ def sweep(
         Whether to compute cases that the folder holds already.
     timeout : float, optional
         Seconds that a case may take. Cases then run in processes of their own, so that one that hangs or dies loses
-        only itself; starting them takes about 2 s.
+        only itself; starting them takes about 3 s.
     record : {"product", "distributions", "cells"}
         What is kept of every case; other than the product, each case is a file in the folder, and
         `studies.open_cases` opens them together. The result holds the summaries either way.
