@@ -28,7 +28,7 @@ from studies.sweep import run, space, sweep
 BEFORE = Before()
 PRODUCT = {"resolution.record": "product"}
 PLAIN = PRODUCT | {"resolution.control_variate": False}
-CASES = 64  # of an operating point, in batches of 32 as sweeps have them
+CASES = 128  # a batch of a sweep
 
 
 def scenes(values=None, before=None, preset="paper"):
@@ -120,8 +120,7 @@ def case():
 
     def now(numbers, apart=False, scene=new):
         cases = [space.Case((0,), {"rolls.gap": gaps[k] if apart else 0.06}, k) for k in numbers]
-        for first in range(0, len(cases), 32):
-            run.run_batch(space.SweepSpec(scene), cases[first : first + 32])
+        run.run_batch(space.SweepSpec(scene), cases)
 
     every = range(CASES)
     times = turns(lambda: before(every), lambda: now(every), 15)
@@ -132,7 +131,6 @@ def case():
     show("case of a sweep, each at another gap", *(each / CASES for each in times), 0.35)
     halves = range(CASES // 2), range(CASES // 2, CASES)
     with ThreadPoolExecutor(2) as pool:
-        sys.setswitchinterval(2e-4)  # as sweeps do
         for scene, what in ((new, ""), (controlled, ", control variate")):
             one, two = turns(
                 lambda scene=scene: now(every, scene=scene),
@@ -141,7 +139,6 @@ def case():
                 time.perf_counter,
             )
             show(f"today, replicates{what}: one thread, two, wall", one / CASES, two / CASES, 1 / 1.9)
-        sys.setswitchinterval(5e-3)
 
 
 def many():

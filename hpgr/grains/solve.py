@@ -16,7 +16,9 @@ from hpgr.laws.roll_width import WHOLE, Slices
 from hpgr.scene import Scene
 
 _AT_ONCE = 4000  # points whose closed form is taken at once: each takes up to 20 kB
-_TOGETHER = 100_000  # cells of the runs crushed at once: with half or four times as many a case takes 3 % longer
+_TOGETHER = (
+    150_000  # cells of the runs crushed at once: with a third less, or four times as many, a case takes 3 % more
+)
 _CONTROLLED_EXPONENT = 10.0  # of fragments; completion takes breaks in proportion to it: seconds at 1e6
 _ROUNDED = 1 + 1.2e-7  # covers the rounding of a size to float32
 FRACTIONS = (0.5, 0.8)  # of the percentiles every product is summarised by
@@ -369,7 +371,7 @@ def corrected(counts: np.ndarray, complete: np.ndarray, exact: np.ndarray) -> np
     Where no cell of the latter passes, the ratio is that of the next coarser sieve, 1 above all: 0 would be too little
     in the mean.
     """
-    ratio = np.divide(counts, complete, out=np.ones(counts.shape), where=complete > 0)
-    sieves = np.arange(counts.shape[-1])
-    known = np.maximum(sieves, np.minimum((complete == 0).sum(axis=-1, keepdims=True), sieves[-1]))
-    return np.maximum.accumulate(exact * np.take_along_axis(ratio, known, axis=-1), axis=-1)
+    known = complete > 0
+    ratio = np.divide(counts, complete, out=np.ones(counts.shape), where=known)
+    finest = np.take_along_axis(ratio, known.argmax(axis=-1)[..., None], axis=-1)
+    return np.maximum.accumulate(exact * np.where(known, ratio, finest), axis=-1)

@@ -31,7 +31,7 @@ _SUMMARY = {name: entry for name, entry in _KNOWN.items() if not {"point", "cell
 _AHEAD = 4  # batches in flight for each thread of the workers: enough that none waits for the driver
 _AHEAD_WHOLE = 2  # the same where cases are told whole, which takes memory
 _BATCH = 128  # cases a task holds at most: dask takes 3 ms a task (1,000 cases with files: 32 -> 128 x 0.87)
-_TOGETHER = 200_000  # cells, and points, of cases run at once: more gain nothing, and take the memory of all
+_TOGETHER = 200_000  # points of cases run at once, whose beds are all held
 _BATCH_SECONDS = 2.0  # predicted for a task at most, so that progress shows and little is lost with a worker
 _PREDICTED = 100  # operating points whose cost is predicted; that of more is scaled up
 _TICK = 0.2  # s between looks at what other drivers have finished
@@ -93,7 +93,8 @@ def run_cases(runner: Runner, cases: list[Case]) -> list[CaseResult]:
         points = runner.run(cases)
     except Exception as error:  # a fault in one case must not lose the others
         if len(cases) > 1:
-            return [result for case in cases for result in run_cases(runner, [case])]
+            half = len(cases) // 2
+            return run_cases(runner, cases[:half]) + run_cases(runner, cases[half:])
         refused = isinstance(error, ValueError | MemoryError)
         told = faults_of(error) if isinstance(error, ValidationError) else str(error)
         words = told if refused else f"{type(error).__name__}: {told}"
@@ -135,7 +136,7 @@ def run_batch(spec: SweepSpec, cases: list[Case]) -> list[CaseResult]:
     if spec.code and spec.code != code_version():
         raise OtherCode("a worker's hpgr or libraries differ from the driver's; install the same on both")
     runner, grid = Runner(spec, threads_here()), spec.base.resolution
-    step = max(1, _TOGETHER // (grid.streamlines * max(grid.snapshots * grid.cells, grid.points)))
+    step = max(1, _TOGETHER // (grid.streamlines * grid.points))
     parts = (cases[first : first + step] for first in range(0, len(cases), step))
     return [result for part in parts for result in run_cases(runner, part)]
 
