@@ -37,17 +37,15 @@ class Variable(NamedTuple):
 # worker_lost: its process died
 STATUS = {"ok": 0, "refused": 1, "failed": 2, "timeout": 3, "worker_lost": 4}
 
-_POINT = ("streamline", "point")
+_LINE, _POINT = ("streamline",), ("streamline", "point")
 _WHOLE, _ESTIMATE = "whole gap", "estimated: bias + 2 standard errors"
 _STATUS_ATTRIBUTES = {"flag_values": np.array(list(STATUS.values()), np.int8), "flag_meanings": " ".join(STATUS)}
 
 COORDINATES = {
     "time": Variable(("time",), "1", "snapshot number", "snapshots of the steady machine", np.int32),
     "elapsed_time": Variable(("time",), "s", "time since the machine was filled", dtype=np.float64),
-    "steady": Variable(
-        ("time",), "1", "whether the snapshot is steady", "taken after one residence time or later", np.int8
-    ),
-    "xi": Variable(("streamline",), "1", "position of the streamline", "0 mid-plane, 1 roll", np.float64),
+    "steady": Variable(("time",), "1", "whether the snapshot is steady", "after one residence time or later", np.int8),
+    "xi": Variable(_LINE, "1", "position of the streamline", "0 mid-plane, 1 roll", np.float64),
     "x": Variable(_POINT, "m", "distance from the mid-plane", "across the gap", np.float64),
     "height": Variable(_POINT, "m", "height above the minimum gap", dtype=np.float64),
     "residence_time": Variable(_POINT, "s", "residence time", "since the first material point", np.float64),
@@ -57,9 +55,7 @@ COORDINATES = {
 
 VARIABLES = {
     "size": Variable(("time", *_POINT, "cell"), "m", "grain size"),
-    "mass_fraction": Variable(
-        ("time", *_POINT, "sieve"), "1", "mass fraction retained", "between this sieve and the next finer one"
-    ),
+    "mass_fraction": Variable(("time", *_POINT, "sieve"), "1", "mass fraction retained", "above the next finer sieve"),
     "speed": Variable(_POINT, "m s-1", "speed", "along the streamline"),
     "volumetric_strain_rate": Variable(_POINT, "s-1", "volumetric strain rate", "compaction positive"),
     "shear_strain_rate": Variable(_POINT, "s-1", "shear strain rate", "triaxial"),
@@ -69,7 +65,7 @@ VARIABLES = {
     "pressure": Variable(_POINT, "Pa", "mean stress p", "compression positive"),
     "shear_stress": Variable(_POINT, "Pa", "shear stress q", "triaxial"),
     "on_shear_limit": Variable(
-        _POINT, "1", "whether on the shear limit", "shear beyond the convexity limit is taken as plastic", np.int8
+        _POINT, "1", "whether on the shear limit", "shear beyond it is taken as plastic", np.int8
     ),
     "throughput": Variable((), "kg s-1", "throughput", "solids through the whole gap"),
     "pressing_force": Variable((), "N", "pressing force", "presses the rolls on the bed"),
@@ -77,28 +73,20 @@ VARIABLES = {
     "torque": Variable((), "N m", "torque", "of both drives"),
     "power": Variable((), "W", "power", "of both drives"),
     "specific_energy": Variable((), "J kg-1", "specific energy", "power over throughput"),
-    "specific_throughput": Variable(
-        (), "kg m-3", "specific throughput", "throughput over roll diameter, width and surface speed"
-    ),
+    "specific_throughput": Variable((), "kg m-3", "specific throughput", "over roll diameter, width and surface speed"),
     "nip_angle": Variable((), "rad", "nip angle", "roll angle above the minimum gap at which compaction begins"),
     "force_angle": Variable((), "rad", "force angle", "at which the pressing force would take the bed's power"),
     "operating_gap": Variable((), "m", "operating gap", "carries the specific pressing force of the scene"),
     "peak_pressure": Variable((), "Pa", "peak pressure", "largest mean stress in the bed"),
     "peak_pressure_height": Variable((), "m", "height of the peak pressure", "above the minimum gap"),
-    "streamline_peak_pressure": Variable(
-        ("streamline",), "Pa", "peak pressure of the streamline", "largest mean stress on it"
-    ),
-    "streamline_peak_pressure_height": Variable(
-        ("streamline",), "m", "height of the streamline's peak pressure", "above the minimum gap"
-    ),
-    "continuity_solid_fraction": Variable(
-        ("streamline",), "1", "solid fraction by continuity", "what mass continuity would need at the exit"
-    ),
+    "streamline_peak_pressure": Variable(_LINE, "Pa", "peak pressure of the streamline", "largest mean stress on it"),
+    "streamline_peak_pressure_height": Variable(_LINE, "m", "height of the streamline's peak", "above the minimum gap"),
+    "continuity_solid_fraction": Variable(_LINE, "1", "solid fraction by continuity", "that it would need at the exit"),
     "shear_limit_fraction": Variable((), "1", "fraction of points on the shear limit", "of all material points"),
     "passing": Variable(("streamline", "sieve"), "1", "mass fraction passing", "product of the stream tube"),
     "passing_total": Variable(("sieve",), "1", "mass fraction passing", "product of the whole gap"),
-    "p50": Variable(("streamline",), "m", "product P50", "size that 50 % of the stream tube's product passes"),
-    "p80": Variable(("streamline",), "m", "product P80", "size that 80 % of the stream tube's product passes"),
+    "p50": Variable(_LINE, "m", "product P50", "size that 50 % of the stream tube's product passes"),
+    "p80": Variable(_LINE, "m", "product P80", "size that 80 % of the stream tube's product passes"),
     "p50_total": Variable((), "m", f"product P50, {_WHOLE}", "size that 50 % of the mass passes"),
     "p80_total": Variable((), "m", f"product P80, {_WHOLE}", "size that 80 % of the mass passes"),
     "passing_slice": Variable(("slice", "sieve"), "1", "mass fraction passing", "product of the slice"),
@@ -108,15 +96,13 @@ VARIABLES = {
     "p80_width_centre": Variable((), "m", "centre product P80", "of the centre of the roll width"),
     "p50_width_edge": Variable((), "m", "edge product P50", "of the edge of the roll width"),
     "p80_width_edge": Variable((), "m", "edge product P80", "of the edge of the roll width"),
-    "breaks_per_cell": Variable(("streamline",), "1", "breaks per cell", "mean number"),
+    "breaks_per_cell": Variable(_LINE, "1", "breaks per cell", "mean number"),
     "below_floor": Variable(
-        ("streamline",), "1", "product below the size floor", "mass fraction; nothing breaks below the floor"
+        _LINE, "1", "product below the size floor", "mass fraction; nothing breaks below the floor"
     ),
     "volume": Variable(_POINT, "m2", "volume per roll width", "area of the material point's Voronoi cell"),
     "swaps_per_cell": Variable((), "1", "swaps per cell", "mean number in one residence time"),
-    "exchange_substeps": Variable(
-        (), "1", "exchange substeps", "most that a time step of exchange was split into", np.int32
-    ),
+    "exchange_substeps": Variable((), "1", "exchange substeps", "most that a time step was split into", np.int32),
     "streamlines_used": Variable((), "1", "streamlines used", "chosen for the wanted tolerance", np.int32),
     "points_used": Variable((), "1", "points used", "per streamline, chosen for the wanted tolerance", np.int32),
     "cells_used": Variable((), "1", "cells used", "per material point, chosen for the wanted tolerance", np.int32),
@@ -129,7 +115,7 @@ VARIABLES = {
 # what a sweep adds to each of its cases
 SWEEP = {
     "replicate": Variable(
-        ("replicate",), "1", "independent repetition", dtype=np.int32, extra={"standard_name": "realization"}
+        ("replicate",), "1", "independent repetition", "", np.int32, {"standard_name": "realization"}
     ),
     "status": Variable((), "1", "what became of the case", dtype=np.int8, extra=_STATUS_ATTRIBUTES),
     "message": Variable((), "", "why the case holds no result", dtype=object),

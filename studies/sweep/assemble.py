@@ -67,8 +67,8 @@ def assemble(
     return _labelled(space, found, attrs, more).assign_coords(_held(spec.base, space))
 
 
-def _coordinates(space: Space) -> dict[str, xr.Variable]:
-    """Return the coordinates along the dimensions of a sweep: fields, and what places are called."""
+def coordinates(space: Space) -> xr.Dataset:
+    """Return a Dataset of the coordinates along the dimensions of a sweep: fields, and what places are called."""
     found = {}
     for dim, axis in space.axes.items():
         if axis.labels is not None:
@@ -77,7 +77,8 @@ def _coordinates(space: Space) -> dict[str, xr.Variable]:
             entry = schema.field_axis(field, dim)
             found[dim_of(field)] = xr.Variable((dim,), [place[field] for place in axis.places], entry.attributes())
     numbers = np.arange(space.replicates, dtype=np.int32)
-    return found | {"replicate": xr.Variable(("replicate",), numbers, schema.attributes("replicate"))}
+    found["replicate"] = xr.Variable(("replicate",), numbers, schema.attributes("replicate"))
+    return xr.Dataset(coords=found)
 
 
 def _labelled(
@@ -91,7 +92,7 @@ def _labelled(
     }
     # what a mean over replicates has no sense of is a coordinate, which xarray leaves out of it
     apart = [name for name in (*schema.SWEEP, "flags") if name in values]
-    return schema.to_dataset(values, attrs, own).set_coords(apart).assign_coords(_coordinates(space))
+    return schema.to_dataset(values, attrs, own).set_coords(apart).assign_coords(coordinates(space).coords)
 
 
 def _common(name: str) -> bool:

@@ -15,13 +15,13 @@ from hpgr.scene import Scene, field_info
 from studies import Late
 from studies import command as line
 from studies.command import Report, shown_as
-from studies.sweep.space import AXES, SCENE, Axis, Space, SweepSpec, axes_of, dim_of, sobol_design
+from studies.sweep.space import AXES, SCENE, Space, SweepSpec, axes_of, sobol_design
 
 if TYPE_CHECKING:
     import xarray as xr
 
 cost, machine, report = Late("hpgr.cost"), Late("hpgr.bed.machine"), Late("studies.show.report")
-cases = Late("studies.sweep.cases")
+assemble, cases = Late("studies.sweep.assemble"), Late("studies.sweep.cases")
 
 _DRAWS = 32  # samples of a calibration
 _MOST_FORCE = 2.0  # on the narrowest gap of a default range, over that of the scene's own gap
@@ -282,28 +282,17 @@ def _write_csv(path: Path, result: "xr.Dataset", sieve: float) -> None:
         csv.writer(file).writerows(report.csv_rows(result, sieve))
 
 
-def _headings(dim: str, axis: Axis) -> list[str]:
-    fields = [f"{dim_of(name).replace('_', ' ')} [{unit_shown(field_info(name).unit)[0]}]" for name in axis.fields]
-    return [text.removesuffix(" [1]") for text in (fields if axis.labels is None else [dim, *fields])]
-
-
-def _place(axis: Axis, index: int) -> list[str]:
-    values = axis.places[index]
-    shown = ((values[name], field_info(name).unit) for name in axis.fields)
-    texts = [value if isinstance(value, str) else show(value, unit) for value, unit in shown]
-    return texts if axis.labels is None else [str(axis.labels[index]), *texts]
-
-
 def _cases(scene: Scene, space: Space, options: Options, folder: Path) -> list[str]:
     """Return in words what a sweep would run: its operating points, with predicted memory and time."""
     scene = scene.with_values({"resolution.record": options.record})
     spec = SweepSpec(scene, options.seed, options.tolerance, options.max_cost, code=cases.code_version())
     kept = {} if options.recompute else cases.finished(spec, space, folder)
-    headings = [heading for dim, axis in space.axes.items() for heading in _headings(dim, axis)]
+    known = assemble.coordinates(space)
+    axes = [axis for dim in space.axes for axis in report.swept(known, dim)]
     rows, refused, seconds = [], [], 0.0
     for case in Space(space.axes).cases():
-        axes = zip(space.axes.values(), case.index[:-1], strict=True)
-        place = [text for axis, k in axes for text in _place(axis, k)]
+        at = dict(zip(space.axes, case.index, strict=False))
+        place = [report.value_text(axis, axis.values[at[axis.dims[0]]]) for axis in axes]
         try:
             predicted = cost.predict(scene.with_values(case.values))
         except ValidationError as error:
@@ -314,7 +303,7 @@ def _cases(scene: Scene, space: Space, options: Options, folder: Path) -> list[s
         figures = [f"{predicted.bytes / 1e6:.1f} MB", f"{predicted.seconds * 1e3:.1f} ms"]
         figures += [f"{done} of {space.replicates}"] if kept else []
         rows.append([*place, *figures])
-    table = report.aligned([*headings, "memory", "time", *(["finished"] if kept else [])], rows)
+    table = report.aligned([*map(report.axis_label, axes), "memory", "time", *(["finished"] if kept else [])], rows)
     lines = [f"{scene}\n", table, *refused, ""]
     if options.tolerance is not None:
         lines.append(
