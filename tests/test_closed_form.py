@@ -2,7 +2,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
 from support import KS, SIGMAS, critical_log_stress, draw, ks_distance, laws, march, paper, sized, streams
 
 from hpgr import simulate
@@ -66,20 +65,6 @@ def test_percentiles_of_a_power_law_product_and_of_a_step():
         )
         assert found == pytest.approx(0.8 ** (1 / gamma) * 0.004, rel=1e-12)
     assert percentile(FEEDS["single"].passing, np.array(0.5), 0.06) == pytest.approx(0.06, rel=1e-12)
-
-
-@each
-@pytest.mark.parametrize("critical", [0.002, 0.02])
-def test_expected_breaks_by_another_quadrature(feed, critical):
-    """Mean of 1 + gamma ln(s0 / s_c) over the feed above s_c, by quadrature over its quantiles."""
-    start, gamma = float(feed.passing(critical)), 0.35
-
-    def breaks(fraction):
-        return 1 + gamma * math.log(float(feed.quantile(fraction)) / critical)
-
-    kinks = [f for f in (0.3, 0.6) if f > start]
-    wanted = quad(breaks, start, 1 - 1e-12, points=kinks or None, limit=200)[0]
-    assert float(expected_breaks(feed, critical, gamma)) == pytest.approx(wanted, rel=1e-3)
 
 
 def test_expected_breaks_of_one_size():

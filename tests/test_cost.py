@@ -20,11 +20,6 @@ def test_prediction_covers_the_result(record, substeps):
     assert predicted.seconds > 0
 
 
-def test_prediction_is_near_what_recorded_cells_take():
-    scene = paper({"resolution.cells": 1000, "resolution.points": 101})
-    assert cost.predict(scene).bytes == pytest.approx(simulate(scene)["size"].nbytes, rel=0.2)
-
-
 @pytest.mark.parametrize(
     "name", ["resolution.streamlines", "resolution.points", "resolution.cells", "resolution.snapshots"]
 )

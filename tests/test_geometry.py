@@ -48,19 +48,8 @@ def test_outermost_streamline_meets_the_roll_in_value_and_slope(machine):
     assert roll_surface(machine, top) == pytest.approx(machine.entry_gap / 2, rel=1e-9)
     assert bed.outer(top) == pytest.approx(machine.entry_gap / 2, rel=1e-9)
     assert bed.slope(top) == pytest.approx(top / math.sqrt(radius**2 - top**2), rel=1e-7)
-
-
-@given(any_rolls)
-def test_outermost_streamline_widens_all_the_way_up(machine):
-    bed = bed_of(machine)
-    y = np.linspace(0, bed.height, 101)[1:-1]
-    assert np.all(bed.slope(y) > 0)
-
-
-@given(any_rolls)
-def test_slope_is_the_derivative(machine):
-    bed = bed_of(machine)
-    y, h = np.linspace(0.0, 1.0, 9) * bed.height, 1e-30
+    y, h = np.linspace(0.01, 0.99, 99) * top, 1e-30
+    assert np.all(bed.slope(y) > 0)  # it widens all the way up
     assert bed.outer(y + 1j * h).imag / h == pytest.approx(bed.slope(y), rel=1e-12)
 
 

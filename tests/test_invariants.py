@@ -54,23 +54,6 @@ def test_any_scene_ends_well_flagged_or_refused(places, kind, chosen, snapshots,
         assert outcome.kind != "fault", outcome.message
 
 
-@pytest.mark.slow
-@given(st.floats(0, 1), st.floats(0, 1), st.floats(1e-3, 1e3), st.sampled_from([0, 1, 2, 3, 17]), st.booleans())
-def test_any_rolls_end_well_flagged_or_refused(gap_place, rise_place, diameter, cells, exchange):
-    gap = diameter * 10 ** (6 * (gap_place - 1))
-    values = {
-        "rolls.diameter": diameter,
-        "rolls.gap": gap,
-        "rolls.entry_gap": gap + 0.5 * diameter * rise_place**3,
-        "feed.bottom_size": 0.1 * min(gap, 1.0),
-        "feed.top_size": min(gap, 1.0),
-        "exchange": {} if exchange else None,
-        "resolution.cells": cells,
-    }
-    outcome = judge.judge(SMALL | values)
-    assert outcome.kind != "fault", outcome.message
-
-
 # --- the checker sees each kind of fault ---------------------------------------------------------------------
 
 STILL = {"exchange": {"interval": 1}, "resolution.snapshots": 3}

@@ -3,7 +3,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from support import KS, SIGMAS, crush, first_cells, paper, sized, under
+from support import SIGMAS, crush, first_cells, paper, sized, under
 
 from hpgr import presets, simulate
 from hpgr.bed.loaded import inputs_of, load_bed
@@ -48,23 +48,6 @@ def test_only_compacting_points_crush():
     bed = under(np.full((1, 3), 5e6))
     bed.kinematics.volumetric_rate[0, 1] = -1.0
     assert solve.crushing_stress(paper(), bed).tolist() == [[5e6, 0.0, 5e6]]
-
-
-@pytest.mark.parametrize("gamma", [0.35, 1.0])
-def test_closed_form_is_the_limit_of_the_march(gamma):
-    """KS at 1e-6 on every sieve, plus 0.5 % for grains that the last steps before the peak leave unfinished."""
-    cells = sized(50_000, 1_000)
-    closed = paper({"strength.cushioning": INF, "fragments.exponent": gamma} | PLAIN)
-    marched = closed.with_values({"strength.cushioning": NO_CUSHION, "resolution.cells": cells})
-    history = load(closed, 1601)
-    exact, found = crush(closed, history, 0, 0), crush(marched, history, 0, 0)
-    assert np.max(np.abs(found.passing - exact.passing)) < 0.005 + KS / math.sqrt(cells)
-    # breaks scatter like a Poisson number, percentiles in passing like a binomial one
-    assert found.breaks == pytest.approx(exact.breaks, abs=0.02 + SIGMAS * math.sqrt(4 / cells))
-    for fraction, size in zip((0.5, 0.8), found.total_percentiles, strict=True):
-        critical = closed.strength.critical_size(np.log(history.max(axis=1) / 0.84e6))
-        there = crushed_passing(closed.feed, float(size), critical, gamma).mean()
-        assert abs(there - fraction) < 0.005 + SIGMAS * math.sqrt(fraction * (1 - fraction) / (3 * cells))
 
 
 def test_total_percentiles_are_those_of_the_mixture():
