@@ -46,6 +46,7 @@ _SHIFT_30, _SHIFT_27, _SHIFT_31 = np.uint64(30), np.uint64(27), np.uint64(31)
 _SHIFT_12 = np.uint64(12)
 _0F, _1F, _3F, _UNLIKE = np.float32(0.0), np.float32(1.0), np.float32(3.0), np.float32(UNLIKE)
 _LOST, _MORE = np.float32(1e-37), np.float32(1.0 + 3e-6)
+_TO_BITS = 1.5 * 2.0**52 + 1023.0
 _1 = np.uint64(1)  # places are unsigned, or every one of them would be tested for being negative
 
 
@@ -359,9 +360,9 @@ def classify(sizes, slot, sieves, k, counts):
 
 @_inlined
 def _power(value, exponent):
-    """Return value^exponent of a value > 0, v^e = 2^(e log2 v), to 6e-11.
+    """Return value^exponent, v^e = 2^(e log2 v), of a value in 0 to 1 and an exponent > 0, to 6e-11.
 
-    In plain arithmetic, which unlike calls becomes vectors (10 -> 2.5 ns a value); series in pairs of terms, for a step
+    In plain arithmetic, which unlike calls becomes vectors (10 -> 2 ns a value); series in pairs of terms, for a step
     raises few numbers and would wait for a sum of one term after the other.
     """
     bits = np.float64(value).view(np.int64)
@@ -372,14 +373,13 @@ def _power(value, exponent):
     y2 = y * y
     first, second = 2.0 + y * (2 / 3) + y2 * (2 / 5 + y * (2 / 7)), 2 / 9 + y * (2 / 11) + y2 * (2 / 13 + y * (2 / 15))
     wanted = (np.float64(shift) + z * (first + y2 * y2 * second) * 1.4426950408889634) * exponent
-    above = wanted if wanted > -1000.0 else -1000.0
-    power = above if above < 100.0 else 100.0
-    whole = np.floor(power + 0.5)
-    r = (power - whole) * 0.34657359027997264
+    power = wanted if wanted > -1000.0 else -1000.0
+    near = power + _TO_BITS  # whose lowest bits are the whole power of 2, as an exponent has it
+    r = (power - (near - _TO_BITS)) * 0.34657359027997264
     r2 = r * r
     first, second = 1.0 + r + r2 * (1 / 2 + r * (1 / 6)), 1 / 24 + r * (1 / 120) + r2 * (1 / 720 + r * (1 / 5040))
     root = first + r2 * r2 * second
-    return root * root * np.int64((np.int64(whole) + np.int64(1023)) << np.int64(52)).view(np.float64)
+    return root * root * np.int64(np.float64(near).view(np.int64) << np.int64(52)).view(np.float64)
 
 
 @_inlined
@@ -446,7 +446,7 @@ def _decide(count, before, own, after, weakness, weak, ore, critical_ratio, verd
     before: loops test their arrays for overlap before they run, and two arrays more cost a march of 1,600 points 15 %.
 
     In float32, whose vectors are twice as long and divide four times as fast; what is compared has room for its
-    rounding, 1e-6. Of 1.9 breaks a cell (gamma 0.35, 1,600 points) 0.0006 are left to logarithms.
+    rounding, 1e-6. Of 1.9 breaks a cell (gamma 0.35, 1,600 points) 0.0013 are left to logarithms.
     """
     per_size, flat = np.float32(ore.inverse_size), _0F if ore.inverse_size > 0.0 else _1F
     # what may leave the range of float32 decides nothing: then only the logarithms do
@@ -493,14 +493,14 @@ def _decide_by_logarithms(count, sizes, weakness, slot, places, ore, log_stress,
 
 
 @_inlined
-def _list_breaks(candidates, found_bounds, verdicts, bounds, places):
-    """Store the bounds found and leave in `places` those that break; return their number."""
+def _list_breaks(candidates, found_bounds, verdicts, bounds, places, own):
+    """Store the bounds found and leave in `places` and `own` those that break; return their number."""
     # without branches: a mispredicted one costs more than the store
     found = np.int64(0)
     for k in range(candidates):
         p = places[k]
         bounds[p] = found_bounds[k]
-        places[found] = p
+        places[found], own[found] = p, own[k]
         found += verdicts[k]
     return found
 
@@ -524,18 +524,22 @@ def _exponent_of(exponent, size, ore):
     return wanted if wanted < _MOST_EXPONENT else _MOST_EXPONENT
 
 
+@_inner
+def _fill(exponents, exponent):
+    """Fill the exponents of fragment ratios, if there are any, where they do not depend on the parent."""
+    if exponent is not None:
+        for k in range(exponents.size):
+            exponents[k] = exponent
+
+
 @_inlined
-def _raise_ratios(exponent, sizes, streams, places, found, whole, ore, own, ratios, exponents, unsure):
+def _raise_ratios(exponent, own, streams, places, found, whole, ore, ratios, exponents, unsure):
     """Raise the fragment ratios to the exponents of their parents, where there are any.
 
     The library's power, which the bits are defined by, is taken where ours may give another float32: next to a half.
     """
     if exponent is not None:
         doubts = np.int64(0)
-        for k in range(whole):
-            exponents[k] = exponent
-        for k in range(found):
-            own[k] = sizes[places[k]]
         if ore.size_exponent != 0.0:
             for k in range(found):
                 exponents[k] = _exponent_of(exponent, own[k], ore)
@@ -551,12 +555,12 @@ def _raise_ratios(exponent, sizes, streams, places, found, whole, ore, own, rati
 
 
 @_inlined
-def _break(sizes, weakness, slot, bounds, places, found, ore, ratios):
+def _break(sizes, weakness, slot, bounds, places, found, ore, own, ratios):
     """Replace each cell that breaks by its fragment; set anew its bound and its neighbours', around the ends too."""
     cells = sizes.size - 2
     for k in range(found):
-        p, ratio = np.uint64(places[k]), ratios[k]  # one kind of place to compile `_unshielded` for
-        sizes[p] = np.float32(sizes[p] * ratio if sizes[p] * ratio > SMALLEST else SMALLEST)
+        p, size = np.uint64(places[k]), own[k] * ratios[k]  # one kind of place to compile `_unshielded` for
+        sizes[p] = np.float32(size if size > SMALLEST else SMALLEST)
         bounds[p - _1] = _unshielded(sizes, weakness, slot, p - _1, ore)
         bounds[p] = _unshielded(sizes, weakness, slot, p, ore)
         bounds[p + _1] = _unshielded(sizes, weakness, slot, p + _1, ore)
@@ -613,6 +617,7 @@ def crush(parcels, passage, path, ore, work, record):
     log_stress, critical_ratio = path
     sieves, counts = record.sieves, record.counts
     cells = parcels.sizes.shape[1] - 2
+    _fill(exponents, ore.inverse_exponent)
     for k in range(passage.slots.size):
         slot, line = passage.slots[k], passage.lines[k]
         sizes, streams = parcels.sizes[slot], parcels.streams[slot]
@@ -636,15 +641,15 @@ def crush(parcels, passage, path, ore, work, record):
                     if _decide(whole, before, own, after, weakness, weak, ore, critical, verdicts):
                         level = log_stress[line, j]
                         _decide_by_logarithms(count, sizes, weakness, slot, places, ore, level, before, verdicts)
-                found = _list_breaks(count, before, verdicts, bounds, places)
+                found = _list_breaks(count, before, verdicts, bounds, places, own)
                 _count(sizes, places, found, sieves, k, np.int64(-1), counts)
-                whole = (found + BLOCK - 1) // BLOCK * BLOCK
+                whole = (found + 7) // 8 * 8
                 _draw(streams, places, found, whole, states, ratios)
                 if ore.fragments == POWER_LAW:
                     exponent, unsure = ore.inverse_exponent, verdicts
-                    _raise_ratios(exponent, sizes, streams, places, found, whole, ore, own, ratios, exponents, unsure)
+                    _raise_ratios(exponent, own, streams, places, found, whole, ore, ratios, exponents, unsure)
                 _draw_strength(streams, weakness, slot, places, found, ore)
-                _break(sizes, weakness, slot, bounds, places, found, ore, ratios)
+                _break(sizes, weakness, slot, bounds, places, found, ore, own, ratios)
                 _count(sizes, places, found, sieves, k, np.int64(1), counts)
                 _renew_blocks(bounds, block_bounds, active, actives, cells)
                 parcels.breaks[slot] += found
