@@ -27,6 +27,8 @@ class Variable(NamedTuple):
     dtype: type | None = np.float32  # None: as the values are
     extra: Mapping[str, Any] = {}  # further CF attributes
 
+    __hash__ = object.__hash__  # as a key it is itself
+
     def attributes(self) -> dict[str, Any]:
         """Return the CF attributes."""
         given = {"units": self.units, "long_name": self.long_name, "comment": self.comment}
@@ -169,44 +171,34 @@ def to_dataset(values: Mapping[str, Any], attrs: Mapping[str, Any], own: Mapping
     """
     import xarray as xr  # late: 0.4 s that a sweep's cases and a machine's gap need not wait for
 
-    table = {**COORDINATES, **VARIABLES, **SWEEP, **own} if own else _TABLE
+    table = {**_TABLE, **own}
     arrays = {name: _stored(value, table[name].dtype) for name, value in values.items() if value is not None}
-    known = tuple(
-        (name, array.shape, (tuple(array.tolist()), array.dtype) if table[name].dims == (name,) else None)
-        for name, array in arrays.items()
-    )
-    # a copy takes a third of the time that labels do
-    found = (_labels(table, known) if own else _labels_of_tables(known)).copy()
+    axes = {name: (tuple(array.tolist()), array.dtype) for name, array in arrays.items() if table[name].dims == (name,)}
+    found = _labels(tuple((name, table[name], arrays[name].shape, axes.get(name)) for name in arrays)).copy()
     variables = found.variables
-    for name, array in arrays.items():
-        dims = table[name].dims
-        if dims != (name,):
-            # as a Variable, lest xarray ask whether the array is of dask or pint, whose import takes 0.4 s
-            variables[name].data = xr.Variable(dims, array, fastpath=True)
+    for name in arrays.keys() - axes.keys():
+        # as a Variable, lest xarray ask whether the array is of dask or pint, whose import takes 0.4 s
+        variables[name].data = xr.Variable(table[name].dims, arrays[name], fastpath=True)
     found.attrs.update(attrs)
     return found
 
 
-@lru_cache(8)
-def _labels_of_tables(known: tuple) -> "xr.Dataset":
-    return _labels(_TABLE, known)
-
-
-def _labels(table: Mapping[str, Variable], known: tuple) -> "xr.Dataset":
-    """Return a Dataset without values, given names, shapes, and values and type of what has a dimension of its own."""
+@lru_cache(8)  # a copy takes a third of the time
+def _labels(known: tuple) -> "xr.Dataset":
+    """Return a Dataset whose values are those of its axes alone, given names, variables, shapes and axes."""
     import pandas as pd
     import xarray as xr
 
     made = {}
-    for name, shape, index in known:
-        row, stored = table[name], np.broadcast_to(0.0, shape) if index is None else np.array(*index)
-        if index is not None and stored.dtype.kind in "if":
+    for name, row, shape, axis in known:
+        stored = np.broadcast_to(0.0, shape) if axis is None else np.array(*axis)
+        if axis is not None and stored.dtype.kind in "if":
             stored.flags.writeable = False  # all copies share it
             made[name] = xr.Variable(row.dims, pd.Index(stored), row.attributes())
         else:
             made[name] = xr.Variable(row.dims, stored, row.attributes(), fastpath=True)
     # all as coordinates first: xr.Dataset(data, coords), which looks for what must be merged, takes a sixth longer
-    data = [name for name in made if name not in COORDINATES and name not in table[name].dims]
+    data = [name for name, row, *_ in known if name not in COORDINATES and name not in row.dims]
     return xr.Coordinates(made).to_dataset().reset_coords(data)
 
 
