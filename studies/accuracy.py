@@ -20,7 +20,7 @@ import numpy as np
 from hpgr.scene import Scene, levels
 from studies import Late
 from studies import command as cli
-from studies.convergence import ROUNDING, jackknife, pareto, richardson
+from studies.convergence import ROUNDING, jackknife, richardson, unbeaten
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -266,7 +266,7 @@ def _front(plan: Plan, found: dict[str, tuple]) -> dict[str, tuple]:
     names, axes = {_grid_of(name): name for name in plan.levels}, ("streamlines", "points", "cells")
     error = np.abs(found["combination_bias"][1]) + 2 * found["combination_noise"][1]
     worst = error[:, :SAMPLED].max(axis=1)
-    front = pareto(found["combination_wall_time"][1], worst).astype(np.int8)
+    front = unbeaten(-found["combination_wall_time"][1], -worst).astype(np.int8)
     words = "largest error of P50, P80 and percent below 1 mm: |bias| + 2 standard errors, relative"
     return {
         **{f"combination_{axis}": (entry(axis), column) for axis, column in zip(axes, np.array(rows).T, strict=True)},

@@ -29,13 +29,11 @@ def richardson(coarse, medium, fine) -> np.ndarray:
     return fine + (fine - medium) / (2**order - 1)
 
 
-def pareto(cost, error) -> np.ndarray:
-    """Return where nothing else is at most as costly and at most as wrong; of equals the first."""
-    order = np.lexsort((error, cost))
-    least = np.minimum.accumulate(np.asarray(error, float)[order])
-    front = np.zeros(order.size, bool)
-    front[order[np.diff(least, prepend=np.inf) < 0]] = True
-    return front
+def unbeaten(*figures: np.ndarray) -> np.ndarray:
+    """Return which choices no other beats in every figure, the larger the better."""
+    every = np.stack(figures, axis=-1)
+    better = (every[None] >= every[:, None]).all(-1) & (every[None] > every[:, None]).any(-1)
+    return ~better.any(axis=1) & np.isfinite(every).all(axis=1)
 
 
 def jackknife(statistic: Callable[[np.ndarray], np.ndarray], samples: np.ndarray) -> np.ndarray:

@@ -21,6 +21,7 @@ from hpgr.scene import Scene, check_scene, field_info
 from studies import Late
 from studies import command as line
 from studies.command import Report, shown_as
+from studies.convergence import unbeaten
 from studies.quantities import Quantity, quantity_of, refuse_lost, with_sieves
 from studies.sweep.space import between, ends_of, sobol_points
 
@@ -228,7 +229,7 @@ class _Search:
         self.scales = np.where(spans > 0, spans, 1.0)
         fine, energy, throughput = (means[self.every.index(one)] for one in self.traded)
         fine = fine if self.traded[0].sieve else -fine
-        better = {"best_energy": _unbeaten(fine, -energy), "best_throughput": _unbeaten(fine, throughput)}
+        better = {"best_energy": unbeaten(fine, -energy), "best_throughput": unbeaten(fine, throughput)}
         words = {"long_name": "no other point is finer and better", "units": "1"}
         return result.assign({name: ("sample", flags.astype(np.int8), words) for name, flags in better.items()})
 
@@ -321,13 +322,6 @@ class _Search:
             if field in self.free and not _RADIUS < x < 1 - _RADIUS:
                 found.append(f"{field} at the {'lowest' if x < 0.5 else 'highest'} of its range")
         return found
-
-
-def _unbeaten(*figures: np.ndarray) -> np.ndarray:
-    """Return which points no other beats in every figure, the larger the better."""
-    every = np.stack(figures, axis=-1)
-    better = (every[None] >= every[:, None]).all(-1) & (every[None] > every[:, None]).any(-1)
-    return ~better.any(axis=1) & np.isfinite(every).all(axis=1)
 
 
 # ---- the command line

@@ -9,11 +9,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from hpgr.fields import parts_of
 from hpgr.scene import Scene, field_info, field_value
 
 if TYPE_CHECKING:
-    import numpy as np
     import xarray as xr
 
 # Dimensions with a name of their own, which is also that of the command lines' option, and the scene fields along them.
@@ -64,9 +65,9 @@ class CaseResult(NamedTuple):
     index: tuple[int, ...]
     status: str
     message: str
-    summary: "dict[str, np.ndarray]"
+    summary: dict[str, np.ndarray]
     diagnostics: str = ""
-    whole: "dict[str, np.ndarray] | None" = None
+    whole: dict[str, np.ndarray] | None = None
     attrs: dict[str, Any] | None = None
 
 
@@ -111,22 +112,15 @@ class Space(NamedTuple):
 
     def case(self, number: int) -> Case:
         """Return a case by its number."""
-        index = []
-        for length in reversed(self.shape):
-            number, place = divmod(number, length)
-            index.append(place)
-        *places, replicate = reversed(index)
+        *places, replicate = index = tuple(map(int, np.unravel_index(number, self.shape)))
         values: dict[str, Any] = {}
         for axis, place in zip(self.axes.values(), places, strict=True):
             values |= axis.places[place]
-        return Case((*places, replicate), values, replicate)
+        return Case(index, values, replicate)
 
     def number(self, index: tuple[int, ...]) -> int:
         """Return the number of the case at this index."""
-        found = 0
-        for place, length in zip(index, self.shape, strict=True):
-            found = found * length + place
-        return found
+        return int(np.ravel_multi_index(index, self.shape))
 
     def cases(self) -> Iterator[Case]:
         """Yield every case in its order."""
@@ -338,14 +332,14 @@ def ends_of(ranges: Mapping[str, tuple[Any, Any]]) -> dict[str, tuple[float, flo
     return found
 
 
-def between(ends: Mapping[str, tuple[float, float]], unit: "np.ndarray") -> list[tuple]:
+def between(ends: Mapping[str, tuple[float, float]], unit: np.ndarray) -> list[tuple]:
     """Return a row of values of the fields for each point of the unit cube, (point, field)."""
     whole = [isinstance(low, int) and isinstance(high, int) for low, high in ends.values()]
     rows = ([low + x * (high - low) for x, (low, high) in zip(at, ends.values(), strict=True)] for at in unit.tolist())
     return [tuple(round(value) if k else value for value, k in zip(row, whole, strict=True)) for row in rows]
 
 
-def sobol_points(fields: int, count: int, seed: int) -> "np.ndarray":
+def sobol_points(fields: int, count: int, seed: int) -> np.ndarray:
     """Return the first `count` points of a scrambled Sobol sequence in the unit cube, (point, field)."""
     from scipy.stats import qmc  # late: `--help` does without
 
