@@ -58,7 +58,7 @@ def predict(scene: Scene) -> Cost:
         seconds += product * (0.2e-6 + 0.15e-9 * points + 0.01e-6 * controlled)
     if solver.endswith("lattice"):
         steps = points + grid.snapshots * exchange.interval
-        frames += -(-(points - 1) // exchange.interval) if exchange.record_startup else 0
+        frames += -(-2 * points // exchange.interval) if exchange.startup else 0
         size += 24 * lines * points * cells + 10_000 * lines * points  # parcels; edges of the tessellation
         # the mean field of the reduced lattice takes as long as 700 cells at each point would
         of_step = 4e-7 + 3e-9 * cells if solver == "lattice" else 2e-7 + 3e-10 * cells

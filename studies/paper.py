@@ -232,8 +232,7 @@ def _startup(shown: Scene, seed: int) -> dict[str, Any]:
         "resolution.cells": min(shown.resolution.cells, _STARTUP_CELLS),
         "resolution.record": "cells",
         "resolution.snapshots": 1,
-        "exchange.record_startup": True,
-        "exchange.start": "feed",
+        "exchange.startup": "feed",
         "exchange.interval": max(1, round((shown.resolution.points - 1) / _FRAMES)),
     }
     if shown.exchange is None:  # the lattice without swaps gives the product that a scene without exchange has

@@ -151,7 +151,7 @@ TAKEN = {
         "strength.cushioning": float("inf"),
         "resolution.record": "distributions",
     },
-    "lattice": {"exchange.record_startup": True, "resolution.cells": 3000, "resolution.points": 101},
+    "lattice": {"exchange.startup": "feed", "resolution.cells": 3000, "resolution.points": 101},
     "stress": {"resolution.points": 200_000, "resolution.cells": 0},
 }
 

@@ -468,7 +468,7 @@ def test_loading_a_floated_scene_again_changes_nothing():
 SMALL = {"resolution.streamlines": 2, "resolution.points": 31, "resolution.cells": 20, "resolution.snapshots": 2}
 BASES = {
     "exchange": SMALL
-    | {"exchange": {"record_startup": True, "interval": 7}, "resolution.record": "distributions"}
+    | {"exchange": {"startup": "feed", "interval": 7}, "resolution.record": "distributions"}
     | {"resolution.cells": 100, "fragments.size_floor": "2 mm", "fragments.size_exponent": 0.3},
     "nip": SMALL | {"flow": {"kind": "nip", "nip_angle": "12 deg"}, "rolls.specific_pressing_force": "0.2 N/mm^2"},
     "cake": SMALL | {"flow": {"kind": "nip", "cake_solid_fraction": 0.8}},
@@ -483,9 +483,8 @@ OTHER = {
     "elasticity.integrator": "euler",
     "elasticity.recovery_modulus": 1e9,
     "strength.stress": "major",
-    "exchange.start": "crushed",
+    "exchange.startup": "crushed",
     "exchange.percolation": "gravity",
-    "exchange.record_startup": False,
     "feed.table": ((0.002, 0.0), (0.05, 100.0)),
     "resolution.sieves": (0.001, 0.01, 0.1),
     "remark": "other",

@@ -38,8 +38,8 @@ class SwapRates(NamedTuple):
 class Exchanged(NamedTuple):
     """What only the lattice knows."""
 
-    elapsed_time: np.ndarray  # (time,) time of each snapshot since the first fill, s
-    steady: np.ndarray  # (time,) of bool, whether it was taken after one residence time: the product is that of these
+    elapsed_time: np.ndarray  # (time,) time of each snapshot since the start, s
+    steady: np.ndarray  # (time,) of bool, whether the start was forgotten: the product is that of these
     substeps: int  # most that a time step was split into to keep the swap probabilities of a cell at 1/2
     swaps_per_cell: float  # mean number of swaps a cell takes part in during one residence time
 
@@ -106,8 +106,12 @@ def within(rates: SwapRates, points: int, first: int, last: int) -> SwapRates:
     """Return the rates of the edges between points `first` to before `last` of each streamline, numbered anew."""
     line, point = np.divmod(rates.pairs, points)
     inside = np.all((point >= first) & (point < last), axis=1)
-    pairs = line * (last - first) + point - first
-    return SwapRates(pairs[inside], *(part[inside] for part in rates[1:]))
+    return of_edges(rates._replace(pairs=line * (last - first) + point - first), inside)
+
+
+def of_edges(rates: SwapRates, which: np.ndarray) -> SwapRates:
+    """Return the rates of these edges."""
+    return SwapRates(*(part[which] for part in rates))
 
 
 class Lattice:
@@ -153,6 +157,7 @@ class Lattice:
         entering: Callable | None = None,
     ):
         self._scene, self._rates, self._steady, self._each = scene, rates, steady, cores.each
+        self._full = scene.exchange.startup is not None
         self._seed, self._replicate = seed, replicate
         self._path, self._ore = march.path(scene, log_stress), march.ore(scene)
         self._breaking = np.flatnonzero(can_break(scene, self._path))
@@ -163,6 +168,7 @@ class Lattice:
         self._works = [kernels.make_work(cells) for _ in range(cores.count)]
         self._home = np.arange(log_stress.size).reshape(log_stress.shape)
         self._lines, self._points = np.divmod(self._home.ravel(), log_stress.shape[1])
+        self._beyond = self._points[rates.pairs].max(axis=1)  # of each edge, the further of its two points
         self.slots = self._home
         self._entering = entering
         self.swaps, self.most_substeps = 0, 0
@@ -170,12 +176,19 @@ class Lattice:
         self._swap_key = int(source.generate_state(1, np.uint64)[0])
 
     def advance(self, step: int) -> None:
-        """Take time step `step`: at 0 fill the machine, later shift all parcels and let feed in; crush; swap."""
+        """Take time step `step`: shift all parcels, let feed in; crush; swap.
+
+        An empty machine fills point by point; where the start-up is recorded, all of it at step 0.
+        """
         self.slots = np.roll(self._home, step, axis=1)
         self._let_in(step)
-        at = self._points[self._breaking]
-        self._crush(self._breaking, at, at + 1)
-        self._swap(step)
+        breaking, rates = self._breaking, self._rates
+        if not self._full and step < self._home.shape[1] - 1:
+            breaking = breaking[self._points[breaking] <= step]
+            rates = of_edges(rates, self._beyond <= step)
+        at = self._points[breaking]
+        self._crush(breaking, at, at + 1)
+        self._swap(step, rates)
 
     def keep(self, slots: np.ndarray, sizes: np.ndarray) -> np.ndarray:
         """Copy the sizes of all cells in these slots to `sizes`, (..., cell), m, and return them."""
@@ -206,15 +219,16 @@ class Lattice:
         list(self._each(crush, self._works, parts))
 
     def _let_in(self, step: int) -> None:
-        """Put new parcels in the first points; at the first fill as the bed would have brought them there."""
-        slots = self.slots if step == 0 else self.slots[:, :1]
+        """Put new parcels in the first points; at a fill of all as the bed would have brought them there."""
+        fills = self._full and step == 0
+        slots = self.slots if fills else self.slots[:, :1]
         at_once = max(march.AT_ONCE // (len(slots) * self._scene.resolution.cells), 1)
         for first in range(0, slots.shape[1], at_once):
             part = slots[:, first : first + at_once].T
             bases = np.concatenate([self._bases(step - first - point) for point in range(len(part))])
             march.fill(self.parcels, part.ravel(), self._scene, bases, self._entering)
         kernels.spread(self.parcels, slots.ravel(), self._shares, self._per_size)
-        if step == 0 and self._scene.exchange.start == "crushed":
+        if fills and self._scene.exchange.startup == "crushed":
             self._crush(self._home.ravel(), 0 * self._points, self._points)
 
     def _bases(self, entered: int) -> np.ndarray:
@@ -227,12 +241,12 @@ class Lattice:
         source = np.random.SeedSequence(self._seed, spawn_key=(self._replicate, 0, 0, entered + points))
         return source.generate_state(2 * lines, np.uint64).reshape(lines, 2)
 
-    def _swap(self, step: int) -> None:
-        """Swap cells across all edges, in as many substeps as keep the probabilities of a cell at 1/2."""
+    def _swap(self, step: int, rates: SwapRates) -> None:
+        """Swap cells across these edges, in as many substeps as keep the probabilities of a cell at 1/2."""
         slots, cells = self.slots.ravel(), self._scene.resolution.cells
         totals = self._shares.totals.sum(axis=0)[slots]
         means = (totals + 0.5 * cells) / (float(self._per_size) * cells)
-        edges, most = edges_of(self._scene, self._rates, means)
+        edges, most = edges_of(self._scene, rates, means)
         self.most_substeps = max(self.most_substeps, most)
         largest, per_size = self._scene.feed.largest_grain, self._per_size
         key = np.uint64(kernels.mix(np.uint64((self._swap_key + (step + 1) * 0xD1342543DE82EF95) % 2**64)))
@@ -247,6 +261,20 @@ class Lattice:
         self.swaps += sum(self._each(swap, range(self._shares.totals.shape[0])))
 
 
+def settling(scene: Scene, rates: SwapRates, unbroken: int, points: int) -> int:
+    """Return by how many points at most grains move away from their parcels on the way to the exit.
+
+    That far behind the first parcels of a start nothing is left of what they lacked in neighbours. Large grains rise by
+    their own probability, faster where the mean is no longer the feed's; mixing counts with two standard deviations.
+    """
+    line, point = np.divmod(rates.pairs, points)
+    mean, apart = _class_sizes(scene).mean(), np.abs(np.diff(point)).ravel()
+    rises = rates.rise * (scene.feed.largest_grain - np.where(point[:, 0] < unbroken, mean, 0.0)) * apart
+    mixes = rates.mixing * (mean * apart) ** 2
+    variance = np.bincount(line[:, 0], mixes) + np.bincount(line[:, 1], mixes)
+    return math.ceil((np.bincount(line[:, 0], rises) + 2 * np.sqrt(variance)).max(initial=0))
+
+
 class Above(NamedTuple):
     """What the steady mean field of unbroken feed gives to a lattice that begins at a point of it."""
 
@@ -257,29 +285,33 @@ class Above(NamedTuple):
 
 def settle(scene: Scene, rates: SwapRates, shape: tuple[int, int], first: int) -> Above:
     """Return what enters a lattice at point `first` of a bed (streamline, point) where nothing breaks."""
-    sizes = scene.feed.quantile((np.arange(8 * _CLASSES) + 0.5) / (8 * _CLASSES)).reshape(_CLASSES, 8).mean(axis=1)
-    fractions, most = np.full((*shape, _CLASSES), 1 / _CLASSES), 1
+    sizes, fractions, most = _class_sizes(scene), np.full((*shape, _CLASSES), 1 / _CLASSES), 1
     flat, swaps, work = fractions.reshape(-1, _CLASSES), np.zeros(len(rates.pairs)), np.empty((2, _CLASSES))
 
-    def shift():
+    def shift(rates):
         fractions[:, 1:], fractions[:, 0] = fractions[:, :-1].copy(), 1 / _CLASSES
         means = flat @ sizes
         return *edges_of(scene, rates, means), means
 
-    reach = int(np.abs(np.diff(rates.pairs % shape[1])).max(initial=0))  # points along a streamline between neighbours
-    for _ in range(shape[1] + reach):  # what is at the last point by then has seen the steady field of all others
-        edges, substeps, means = shift()
+    beyond = (rates.pairs % shape[1]).max(axis=1)
+    for step in range(shape[1] + settling(scene, rates, shape[1], shape[1])):
+        edges, substeps, means = shift(rates if step >= shape[1] else of_edges(rates, beyond <= step))
         kernels.swap_mean_field(flat, sizes, edges, means, swaps, *work)
         most = max(most, substeps)
     # The lattice swaps within itself, and not with what is above: its first parcels have done that when they enter.
     # Or large grains, which rise, would be carried in and never out
-    edges, _, means = shift()
+    edges, _, means = shift(rates)
     outside = (rates.pairs % shape[1] < first).sum(axis=1)[edges.turns]  # points of an edge above the lattice
     swaps[:] = 0
     kernels.swap_mean_field(flat, sizes, edges._replace(turns=edges.turns[outside == 1]), means, swaps, *work)
     entering = fractions[:, first].copy()
     kernels.swap_mean_field(flat, sizes, edges._replace(turns=edges.turns[outside == 2]), means, swaps, *work)
     return Above(entering, swaps.sum(), most)
+
+
+def _class_sizes(scene: Scene) -> np.ndarray:
+    """Return the mean sizes of the feed's classes of equal mass, finest first, m."""
+    return scene.feed.quantile((np.arange(8 * _CLASSES) + 0.5) / (8 * _CLASSES)).reshape(_CLASSES, 8).mean(axis=1)
 
 
 def can_break(scene: Scene, path: Path) -> np.ndarray:
@@ -298,9 +330,10 @@ def first_break(scene: Scene, log_stress: np.ndarray) -> int:
 def run(
     scene: Scene, log_stress: np.ndarray, bed: LoadedBed, seed: int, replicate: int, reduced: bool
 ) -> tuple[Cells, Exchanged]:
-    """Run the lattice through one residence time to the steady snapshots, and the start-up's if wished.
+    """Run the lattice until it is steady, and through its snapshots; through the start-up's before them if wished.
 
-    A reduced one begins above the first break, with cells drawn from the mean field of what is above it.
+    It is steady when the parcel at the exit was `settling` points behind the first that entered. A reduced one begins
+    above the first break, with cells drawn from the mean field of what is above it.
     """
     grid, wishes = scene.resolution, scene.exchange
     rates, entering, swaps, substeps = swap_rates(scene, bed), None, 0.0, 1
@@ -310,9 +343,10 @@ def run(
         above = settle(scene, within(rates, grid.points, 0, unbroken), (grid.streamlines, unbroken), first)
         swaps, substeps, entering = above.swaps, above.substeps, _quantile_of(scene, above.entering)
         rates = within(rates, grid.points, first, grid.points)
-    last = grid.points - 1 - first  # the step at which the first parcel that entered is at the exit
+    full = grid.points - 1 - first  # the step at which the first parcel that entered is at the exit
+    last = full + settling(scene, rates, unbroken - first, grid.points - first)
     steady = [last + k * wishes.interval for k in range(grid.snapshots)]
-    steps = [*(range(0, last, wishes.interval) if wishes.record_startup else ()), *steady]
+    steps = [*(range(0, last, wishes.interval) if wishes.startup else ()), *steady]
     sieves, mine = march.cell_sieves(scene), np.ascontiguousarray(log_stress[:, first:])
     product = np.empty((len(steady), grid.streamlines, grid.cells), np.float32)
     shape = (len(steps), *mine.shape, grid.cells)
@@ -322,7 +356,8 @@ def run(
         numbers = {step: k for k, step in enumerate(steady)}
         lattice = Lattice(scene, mine, rates, seed, replicate, numbers, cores, entering)
         for step in range(steps[-1] + 1):
-            before = lattice.swaps
+            if step == full:
+                before = lattice.swaps
             lattice.advance(step)
             if step not in steps:
                 continue
@@ -333,8 +368,7 @@ def run(
             if step >= last:
                 lattice.keep(lattice.slots[:, -1], product[numbers[step]])
                 breaks += lattice.parcels.breaks[lattice.slots[:, -1]]
-    # as of the whole lattice, which goes on for `first` more steps; a start-up of feed swaps more often
-    swaps += (lattice.swaps + first * (lattice.swaps - before)) / grid.cells / (steps[-1] + 1 + first)
+    swaps += (lattice.swaps - before) / grid.cells / (steps[-1] + 1 - full)
     exchanged = Exchanged(
         elapsed_time=np.array(steps) * bed.kinematics.time_step,
         steady=np.array(steps) >= last,

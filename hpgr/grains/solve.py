@@ -58,7 +58,7 @@ def choose(scene: Scene) -> str:
         return "stress only"
     if scene.exchange is not None and scene.rolls.gap < scene.rolls.entry_gap:  # equal gaps: nothing moves or mixes
         moving = scene.exchange.segregation > 0 or scene.exchange.mixing > 0
-        product_only = scene.resolution.record == "product" and not scene.exchange.record_startup
+        product_only = scene.resolution.record == "product" and scene.exchange.startup is None
         return "reduced lattice" if moving and product_only else "lattice"
     strength = scene.strength
     if math.isinf(strength.cushioning) and math.isfinite(strength.weibull_modulus):

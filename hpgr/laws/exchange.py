@@ -37,12 +37,10 @@ class Exchange(Frozen):
     """Shear-induced self-diffusion over shear rate and mean size squared."""
     percolation: Literal["shear", "gravity"] = "shear"
     """What limits percolation: the shear rate alone, or also how fast gravity lets a grain fall."""
-    start: Literal["feed", "crushed"] = "feed"
-    """What the machine is filled with at the start: 'feed', or the bed as 'crushed' without exchange."""
     interval: Count = quantity(20, symbol="n_s", source="ours", example=20, ge=1, le=1_000_000)
     """Time steps between snapshots."""
-    record_startup: bool = False
-    """Whether snapshots of the start-up, from the first fill on, come before the steady ones."""
+    startup: Literal["feed", "crushed"] | None = None
+    """Records the start-up, before the steady snapshots, of a machine full of 'feed', or of the bed as 'crushed'."""
 
     def ceiling(self, shear_rate):
         """Return c = A gammadot / sqrt(g) of v = A gammadot |s - sbar| / (1 + c |s - sbar| / sqrt(sbar)), m^-1/2.

@@ -45,8 +45,8 @@ _STATUS_ATTRIBUTES = {"flag_values": np.array(list(STATUS.values()), np.int8), "
 
 COORDINATES = {
     "time": Variable(("time",), "1", "snapshot number", "snapshots of the steady machine", np.int32),
-    "elapsed_time": Variable(("time",), "s", "time since the machine was filled", dtype=np.float64),
-    "steady": Variable(("time",), "1", "whether the snapshot is steady", "after one residence time or later", np.int8),
+    "elapsed_time": Variable(("time",), "s", "time since the machine began to fill", dtype=np.float64),
+    "steady": Variable(("time",), "1", "whether the snapshot is steady", "its start is forgotten", np.int8),
     "xi": Variable(_LINE, "1", "position of the streamline", "0 mid-plane, 1 roll", np.float64),
     "x": Variable(_POINT, "m", "distance from the mid-plane", "across the gap", np.float64),
     "height": Variable(_POINT, "m", "height above the minimum gap", dtype=np.float64),
