@@ -1,8 +1,9 @@
 import gc
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numba.core.event import end_event, trigger_event
+from numba.core import event
 from support import COMPILED, paper
 
 from hpgr import compiler
@@ -41,16 +42,21 @@ def test_a_function_is_compiled_once_it_has_filled_a_few_numbers(monkeypatch):
     assert [ones(numbers) or numbers[0] for _ in range(4)] == [1, 1, 2, 2]
 
 
-def test_no_garbage_is_collected_while_functions_are_compiled():
-    with trigger_event("numba:compile"):
-        with trigger_event("numba:compile"):  # a function that the first one calls
+def test_no_garbage_is_collected_while_our_functions_are_compiled():
+    ours, other = ({"dispatcher": SimpleNamespace(py_func=each)} for each in (kernels.make_work, event.trigger_event))
+    with event.trigger_event("numba:compile", ours):
+        with event.trigger_event("numba:compile", ours):  # a function that the first one calls
+            pass
+        with event.trigger_event("numba:compile", other):
             pass
         assert not gc.isenabled()
     assert gc.isenabled()
-    end_event("numba:compile")  # of one that has begun before the package was imported
+    with event.trigger_event("numba:compile", other):
+        assert gc.isenabled()
+    event.end_event("numba:compile", ours)  # of one that has begun before the package was imported
     gc.disable()
     try:
-        with trigger_event("numba:compile"):
+        with event.trigger_event("numba:compile", ours):
             pass
         assert not gc.isenabled()  # as the user wished
     finally:

@@ -281,6 +281,15 @@ def test_forces_out_of_reach_are_refused_with_the_reachable_range(scene):
     assert operating_gap(scene, max(low, 1e3) * 1.001) > operating_gap(scene, high * 0.999)
 
 
+def test_a_bed_whose_points_coincide_has_no_operating_gap():
+    """Those of its middle, which starts closest to the stagnant entry, where those of the roll do not yet."""
+    scene = presets.paper().with_values({"flow.entry_fraction": 1e-8})
+    with pytest.raises(
+        ValueError, match=r"flow.entry_fraction: got 1e-08 with 200 points .* raise flow.entry_fraction"
+    ):
+        operating_gap(scene, 1e5)
+
+
 def test_simulate_reports_the_operating_gap_and_keeps_it_in_the_scene():
     scene = pilot({"rolls.specific_pressing_force": "3.5 N/mm^2"})
     dataset = simulate(scene)

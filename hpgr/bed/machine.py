@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hpgr.bed.loaded import BedInputs, Pressed, bear, force_on_roll, inputs_of
+from hpgr.bed.loaded import BedInputs, Pressed, bear, force_on_roll, inputs_of, load_bed
 from hpgr.fields import show
 from hpgr.scene import LEAST_GAP, STEEPEST_ENTRY, Scene, check_scene, field_value
 
@@ -21,6 +21,7 @@ _CARRIED = 1e-6  # relative error of the force at the gap found
 _TRIED = 65  # gaps among which the bed that presses most is looked for
 _FIRST = 4  # of a search are among these, the same for any force nearby
 _NEAREST = 4  # values that are interpolated between
+_SHALLOW = 1e-3  # depth of the entry below which other streamlines may have coinciding points where the roll has none
 _ROLL = np.ones(1)  # its streamline
 
 
@@ -94,7 +95,7 @@ def operating_gap(scene: Scene, specific_pressing_force: float | str) -> float:
     TypeError
         If `scene` is none.
     ValueError
-        If the force is none, or no gap carries it; the message has the reachable range.
+        If the force is none, no gap carries it (the message has the reachable range), or material points coincide.
 
     Examples
     --------
@@ -107,7 +108,11 @@ def operating_gap(scene: Scene, specific_pressing_force: float | str) -> float:
     check_scene(scene)
     if specific_pressing_force is None:  # which a scene may have, as its gap is then its own
         raise ValueError("specific_pressing_force: got None; must be a pressure; such as '3.5 N/mm^2'")
-    return _gap_carrying(_floating(scene), field_value("rolls.specific_pressing_force", specific_pressing_force))
+    inputs, depth = _floating(scene), scene.flow.entry_fraction
+    gap = _gap_carrying(inputs, field_value("rolls.specific_pressing_force", specific_pressing_force))
+    if min(depth, 1 - depth) < _SHALLOW:  # three times as long as the search
+        load_bed(inputs._replace(gap=gap))  # refuses what `simulate` does
+    return gap
 
 
 def float_gap(scene: Scene) -> Scene:
