@@ -374,7 +374,7 @@ class Scene(Frozen):
                 continue  # refused below
             data[name] = dict(part)
             kind = values.get(f"{name}.kind")
-            law = next((law for law in _parts(name) if isinstance(kind, str) and kind in kinds_of(law)), None)
+            law = next((law for law in laws().get(name, []) if isinstance(kind, str) and kind in kinds_of(law)), None)
             if law:
                 data[name] = {key: value for key, value in data[name].items() if key in law.model_fields}
         for name, value in values.items():
@@ -522,7 +522,7 @@ def field_value(name: str, value: Any) -> Any:
     """
     part, _ = _find_field(name)
     section, _, key = name.partition(".")
-    kinds = [kind for law in _parts(section) for kind in kinds_of(law)] if key == "kind" else []
+    kinds = [kind for law in laws().get(section, []) for kind in kinds_of(law)] if key == "kind" else []
     if isinstance(value, str) and value in kinds:
         return value
     if kinds:
@@ -535,21 +535,26 @@ def field_value(name: str, value: Any) -> Any:
         raise ValueError(f"{name}: {fault_in_words(part, (key,), error.errors(include_url=False)[0])}") from None
 
 
-def _parts(section: str) -> list[type[Frozen]]:
-    """Return the models that a section of a scene may hold; none if there is no such section."""
-    field = Scene.model_fields.get(section)
-    return parts_of(field) if field else []
+@cache
+def laws() -> dict[str, list[type[Frozen]]]:
+    """Return the models that each section of a scene may hold, by name; one for a section that is no union."""
+    found = {name: parts_of(field) for name, field in Scene.model_fields.items()}
+    return {name: parts for name, parts in found.items() if parts}
 
 
 @cache
+def fields() -> dict[str, tuple[type[Frozen], Any]]:
+    """Return model and field of every field of a section by dotted name; of a union of laws the first that has it."""
+    found: dict[str, tuple[type[Frozen], Any]] = {}
+    for section, law in ((section, law) for section, every in laws().items() for law in every):
+        for key, field in law.model_fields.items():
+            found.setdefault(f"{section}.{key}", (law, field))
+    return found
+
+
 def _find_field(name: str) -> tuple[type[Frozen], Any]:
-    """Return the model and the field with this dotted name; of a union of laws the first law that has it."""
-    fields: dict[str, tuple[type[Frozen], Any]] = {}
-    for section in Scene.model_fields:
-        for part in _parts(section):
-            for key, field in part.model_fields.items():
-                fields.setdefault(f"{section}.{key}", (part, field))
-    if name not in fields:
-        close = difflib.get_close_matches(str(name), fields, n=3, cutoff=0.3) or ["rolls.gap"]
+    """Return the model and the field with this dotted name."""
+    if name not in fields():
+        close = difflib.get_close_matches(str(name), fields(), n=3, cutoff=0.3) or ["rolls.gap"]
         raise ValueError(f"a scene has no field {name!r}; did you mean {' or '.join(map(repr, close))}?")
-    return fields[name]
+    return fields()[name]

@@ -69,6 +69,8 @@ def test_fields_added_later_are_walked(monkeypatch):
         shape: bool = False
 
     monkeypatch.setattr(ranges, "laws", lambda: {"later": [Later]})
+    every = {f"later.{key}": (Later, field) for key, field in Later.model_fields.items()}
+    monkeypatch.setattr(ranges, "fields", lambda: every)
     found = ranges.numeric_fields.__wrapped__()
     assert set(found) == {"later.pressing", "later.slices"}
     assert found["later.pressing"].ends() == [5e-324, 1e9]

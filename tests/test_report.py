@@ -105,10 +105,10 @@ def test_a_long_table_fits_a_screen():
     assert len(lines) <= 30
     assert max(map(len, lines)) <= 120
     assert "11 of 60 operating points, evenly chosen; the file has all, and --csv writes them" in lines
-    heading, *rows = report.csv_rows(result, 1e-3)
+    rows = report.plant_table(result, 1e-3)
     assert len(rows) == 60
-    assert heading[:4] == ["gap [mm]", "replicates", "throughput [t/h]", "throughput sd [t/h]"]
-    assert rows[0][:3] == pytest.approx([30, 1, 3.6 * float(result["throughput"][0, 0])])
+    assert list(rows)[:4] == ["gap [mm]", "replicates", "throughput [t/h]", "throughput sd [t/h]"]
+    assert rows.iloc[0, :3].tolist() == pytest.approx([30, 1, 3.6 * float(result["throughput"][0, 0])])
 
 
 def test_table_with_lost_cases(result):

@@ -14,11 +14,12 @@ from support import first_cells, paper, plain_industrial, sized
 import hpgr
 from hpgr import Scene, cost, presets, simulate
 from hpgr.bed import loaded
-from hpgr.fields import parts_of, values_of
+from hpgr.fields import values_of
 from hpgr.grains import closed_form, kernels
 from hpgr.results import flags as limits
 from hpgr.results import schema
 from hpgr.run import load, run_scene, run_together
+from hpgr.scene import fields
 from studies import close_circuit, open_cases, optimise
 from studies.circuit import Screen
 from studies.guard.invariants import violations
@@ -531,13 +532,7 @@ def test_no_field_of_a_scene_is_forgotten():
             if any(not np.array_equal(first.values.get(k), found.values.get(k)) for k in first.values | found.values):
                 mattered.add(name)
     assert seen - mattered == MAY_NOT_MATTER | {name for name in seen if name.endswith(".kind")}
-    fields = {
-        f"{section}.{key}"
-        for section, field in Scene.model_fields.items()
-        for part in parts_of(field)
-        for key in part.model_fields
-    }
-    assert seen == fields | {"remark"}
+    assert seen == set(fields()) | {"remark"}
 
 
 # --- the whole ---------------------------------------------------------------------------------------------

@@ -11,18 +11,12 @@ from support import paper
 
 from hpgr import Resolution, Rolls, Scene, presets
 from hpgr.fields import kinds_of, parts_of
-from hpgr.scene import field_info, field_value, levels
+from hpgr.scene import field_info, field_value, fields, levels
 
 INF = math.inf
 ROLLS = {"diameter": 0.8, "width": 0.25, "gap": 0.019, "entry_gap": 0.06, "speed": 1.7}
 FEED = {"kind": "uniform", "bottom_size": 0.001, "top_size": 0.02}
-FIELDS = {
-    f"{section}.{key}": field
-    for section, part in Scene.model_fields.items()
-    for law in parts_of(part)
-    for key, field in law.model_fields.items()
-    if key != "kind"
-}
+FIELDS = {name: field for name, (_, field) in fields().items() if not name.endswith(".kind")}
 COUNTS = {"streamlines", "points", "cells", "snapshots", "substeps", "interval", "slices"}
 FLOATS = [
     name

@@ -11,8 +11,8 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin
 import numpy as np
 from pydantic import ValidationError
 
-from hpgr.fields import Frozen, kinds_of, parts_of, values_of
-from hpgr.scene import Scene
+from hpgr.fields import kinds_of, values_of
+from hpgr.scene import Scene, fields, laws
 from studies import Late
 
 cost, machine = Late("hpgr.cost"), Late("hpgr.bed.machine")
@@ -65,16 +65,10 @@ class Range(NamedTuple):
         return value + math.copysign(1, towards) if self.whole else math.nextafter(value, towards)
 
 
-def laws() -> dict[str, list[type[Frozen]]]:
-    """Return the models that each section of a scene may hold, by name; one for a section that is no union."""
-    found = {name: parts_of(field) for name, field in Scene.model_fields.items()}
-    return {name: parts for name, parts in found.items() if parts}
-
-
 @cache
 def numeric_fields() -> dict[str, Range]:
     """Return the range of every field that holds one number, by dotted name."""
-    found = {name: _range(field) for name, field in _fields().items()}
+    found = {name: _range(field) for name, (_, field) in fields().items()}
     return {name: known for name, known in found.items() if known is not None}
 
 
@@ -82,21 +76,12 @@ def numeric_fields() -> dict[str, Range]:
 def choices() -> dict[str, tuple]:
     """Return the words or truth values of every field that is a choice, by dotted name; kinds of laws are one."""
     found = {f"{name}.kind": tuple(kind for law in each for kind in kinds_of(law)) for name, each in laws().items()}
-    for name, field in _fields().items():
+    for name, (_, field) in fields().items():
         if field.annotation is bool:
             found[name] = (False, True)
         elif get_origin(field.annotation) is Literal:
             found.setdefault(name, get_args(field.annotation))
     return {name: words for name, words in found.items() if words}
-
-
-def _fields() -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, each in laws().items():
-        for law in each:
-            for key, field in law.model_fields.items():
-                found.setdefault(f"{name}.{key}", field)  # of several laws of a section, the first
-    return found
 
 
 def _range(field: Any) -> Range | None:

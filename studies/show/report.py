@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from hpgr.fields import show, unit_shown
@@ -176,8 +177,8 @@ def _blocks(axes: dict[str, list[str]], columns: dict[str, list[str]]) -> list[d
     return blocks
 
 
-def csv_rows(result: xr.Dataset, sieve: float) -> list[list]:
-    """Return a heading and a row for every operating point: axes, replicates, mean and spread of every figure."""
+def plant_table(result: xr.Dataset, sieve: float) -> pd.DataFrame:
+    """Return a row for every operating point: axes, replicates, mean and spread of every figure."""
     points = operating_points(result)
     along = [points[axis.name] for dim in axes_of(result) for axis in swept(result, dim)]
     columns = {axis_label(axis): shown_values(axis) for axis in along}
@@ -185,7 +186,7 @@ def csv_rows(result: xr.Dataset, sieve: float) -> list[list]:
     for heading, values in figures(points, sieve).items():
         name, bracket, unit = heading.partition(" [")
         columns |= {heading: values.mean("replicate").values, f"{name} sd{bracket}{unit}": spread(values).values}
-    return [list(columns), *zip(*(np.asarray(each).tolist() for each in columns.values()), strict=True)]
+    return pd.DataFrame(columns)
 
 
 def _mean_and_spread(mean: float, deviation: float) -> str:

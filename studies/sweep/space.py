@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from hpgr.fields import parts_of
-from hpgr.scene import Scene, field_info, field_value
+from hpgr.scene import Scene, field_info, field_value, fields
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -151,11 +150,9 @@ def dim_of(field: str) -> str:
 @cache
 def _fields_by_name() -> dict[str, list[str]]:
     found: dict[str, dict[str, None]] = {}
-    for section, part in Scene.model_fields.items():
-        for key in (key for law in parts_of(part) for key in law.model_fields):
-            field = f"{section}.{key}"
-            for name in (field, dim_of(field), key):
-                found.setdefault(name, {})[field] = None
+    for field in fields():
+        for name in (field, dim_of(field), field.partition(".")[2]):
+            found.setdefault(name, {})[field] = None
     return {name: list(fields) for name, fields in found.items()}
 
 

@@ -1,6 +1,5 @@
 """The command line that the sweeps over gap, speed and feed share."""
 
-import csv
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -274,12 +273,12 @@ def _report(field: str, caption: str, result: "xr.Dataset", sieve: float, option
 
         lines[0] = bands_table(result, sieve)
         drawn = line.figure(lambda: bands_figure(result, sieve, "\n".join(sayings)))
-    return Report(lines, [result, *[drawn] * options.plot, lambda path, _: _write_csv(path, result, sieve)], lost)
 
+    def write_csv(path: Path, _: str) -> None:
+        table = report.plant_table(result, sieve)
+        table.to_csv(path, index=False, encoding="utf-8-sig")  # with the mark by which spreadsheets know UTF-8
 
-def _write_csv(path: Path, result: "xr.Dataset", sieve: float) -> None:
-    with path.open("w", encoding="utf-8-sig", newline="") as file:  # with the mark by which spreadsheets know UTF-8
-        csv.writer(file).writerows(report.csv_rows(result, sieve))
+    return Report(lines, [result, *[drawn] * options.plot, write_csv], lost)
 
 
 def _cases(scene: Scene, space: Space, options: Options, folder: Path) -> list[str]:
