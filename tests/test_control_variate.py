@@ -9,7 +9,6 @@ from support import paper, sized
 from hpgr import passing, percentile_size, simulate
 from hpgr.grains import march, solve
 from hpgr.grains.solve import Loaded
-from hpgr.laws.roll_width import WHOLE
 from hpgr.run import load
 
 REPLICATES = 200
@@ -93,7 +92,7 @@ def test_passing_rises_within_0_and_1(values, cushioning, cells, snapshots):
 def marched(values, complete):
     scene, bed = load(paper(BASE | values))
     log_stress = scene.strength.log_stress(solve.crushing_stress(scene, bed))
-    found = march.march([scene], log_stress[None], WHOLE, 0, [(0, 0)], complete)
+    found = march.march([scene], march.path(scene, log_stress[None]), 0, [(0, 0, 0)], complete)
     return scene, log_stress, found
 
 
@@ -105,7 +104,7 @@ def test_cells_run_on_to_what_they_come_to_without_cushioning(values):
     assert np.any(found.complete < found.product)
     still = np.repeat(log_stress.max(axis=1, keepdims=True), 100, axis=1)
     free = scene.with_values({"strength.cushioning": "inf"})
-    wanted = march.march([free], np.hstack([log_stress, still])[None], WHOLE, 0, [(0, 0)])
+    wanted = march.march([free], march.path(free, np.hstack([log_stress, still])[None]), 0, [(0, 0, 0)])
     assert np.array_equal(found.complete, wanted.product)
 
 

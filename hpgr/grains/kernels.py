@@ -94,7 +94,7 @@ class Shares(NamedTuple):
 
 
 class Path(NamedTuple):
-    """What loads the parcels, (streamline, point)."""
+    """What loads the parcels, (line, point)."""
 
     log_stress: np.ndarray  # log(sigma_a / sigma_m)
     critical_ratio: np.ndarray  # least effective size over s_m that breaks

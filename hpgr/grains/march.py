@@ -14,7 +14,6 @@ import numpy as np
 from hpgr.grains import kernels
 from hpgr.grains.kernels import Ore, Parcels, Passage, Path, Record
 from hpgr.laws.feed import Feed
-from hpgr.laws.roll_width import Slices
 from hpgr.scene import Scene
 
 _LARGE = 200_000  # cells of all parcels from which they are crushed on all cores
@@ -37,7 +36,7 @@ def ore(scene: Scene) -> Ore:
 
 
 def path(scene: Scene, log_stress: np.ndarray) -> Path:
-    """Return what loads a parcel at log(sigma_a / sigma_m)."""
+    """Return what loads parcels at log(sigma_a / sigma_m)."""
     return Path(log_stress, scene.strength.critical_size_ratio(log_stress))
 
 
@@ -106,29 +105,23 @@ def cores(cells: int) -> Iterator[Cores]:
 
 
 def march(
-    scenes: Sequence[Scene],
-    log_stress: np.ndarray,
-    slices: Slices,
-    seed: int,
-    runs: Sequence[tuple[int, int]],
-    complete: bool = False,
+    scenes: Sequence[Scene], loads: Path, seed: int, runs: Sequence[tuple[int, int, int]], complete: bool = False
 ) -> Cells:
     """March one parcel per slice, streamline and snapshot of each run.
 
     Each parcel is keyed, by `seed` and replicate, so their order does not matter. Runs share calls of the kernels: the
     Python between the calls costs as much as crushing a thousand cells. Scenes may differ in their feed and what loads
-    it: `log_stress`, (scene, streamline, point) log(sigma_a / sigma_m), is that in the middle of the roll width. Runs
-    are numbers of a scene, those of one together, and of an independent repetition. `complete` asks for what the cells
-    come to without cushioning, too.
+    it: `loads` are of shape (load, line, point), the streamlines of one slice of the roll width after the other. Runs
+    are numbers of a scene, those of one together, of what loads it, and of an independent repetition. `complete` asks
+    for what the cells come to without cushioning, too.
     """
-    scene, grid = scenes[0], scenes[0].resolution
-    _, tubes, points = log_stress.shape
-    # every slice marches the same parcels under its own pressure, so that slices differ by that alone
-    loads = path(scene, (log_stress[:, None] + np.log(slices.pressure)[:, None, None]).reshape(-1, points))
-    shape = (len(runs), grid.snapshots, loads.log_stress.shape[0] // len(scenes))
+    scene, grid, points = scenes[0], scenes[0].resolution, loads.log_stress.shape[2]
+    shape = (len(runs), grid.snapshots, loads.log_stress.shape[1])
+    loads = Path(*(each.reshape(-1, points) for each in loads))
     columns = list(itertools.product(runs, range(shape[1]), range(shape[2])))
-    keys = [(replicate, line % tubes, snapshot) for (_, replicate), snapshot, line in columns]
-    lines = np.array([number * shape[2] + line for (number, _), _, line in columns])
+    # every slice marches the same parcels under its own pressure, so that slices differ by that alone
+    keys = [(replicate, line % grid.streamlines, snapshot) for (_, _, replicate), snapshot, line in columns]
+    lines = np.array([load * shape[2] + line for (_, load, _), _, line in columns])
     product, breaks = np.empty((len(keys), grid.cells), np.float32), np.empty(len(keys), np.int64)
     ends = np.empty_like(product) if complete else None
     record, laws = Record(), ore(scene)
@@ -152,7 +145,7 @@ def march(
         kernels.crush(parcels, passage, loads, laws, work, own)
         product[part], breaks[part] = parcels.sizes[:, 1:-1], parcels.breaks
         if ends is not None:
-            critical = loads.critical_ratio.min(axis=1)[lines[part]]
+            critical = loads.critical_ratio[lines[part]].min(axis=1)
             kernels.complete(*parcels[:3], critical, laws.inverse_exponent, laws, work.places)
             ends[part] = parcels.sizes[:, 1:-1]
 
