@@ -32,6 +32,7 @@ def _cushioned(stiffness: float) -> tuple[np.float32, ...]:
     It is exp(-stiffness log(s / sbar)^2), by which cushioning multiplies the effective size, of
     ((s - sbar) / (s + sbar))^2 from 0 to UNLIKE. The error holds whatever the stiffness, and is small up to about 5.
     """
+    stiffness = min(stiffness, 1e30)  # float32 holds it; the error has long been above 1, by which nothing is decided
 
     def exact(squares):
         return np.exp(-stiffness * (2 * np.arctanh(np.sqrt(squares))) ** 2)
