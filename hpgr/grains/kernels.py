@@ -384,7 +384,7 @@ def _power(value, exponent):
 
 @_inlined
 def _unshielded(sizes, weakness, slot, p, ore):
-    """Return the bound of a cell whose neighbourhood is new; nothing below the floor ever breaks.
+    """Return the bound of a cell whose neighbourhood is new.
 
     The constants are float32: what of them is rounded, the margin covers.
     """
@@ -392,7 +392,7 @@ def _unshielded(sizes, weakness, slot, p, ore):
     bound = sizes[p] * np.float32(ore.inverse_size * _MARGIN) + np.float32(0.0 if ore.inverse_size > 0.0 else _MARGIN)
     if weakness is not None:
         bound *= weakness[slot, p]
-    return bound if sizes[p] >= np.float32(ore.size_floor) else _NEVER
+    return bound
 
 
 @_inner
@@ -435,7 +435,7 @@ def _gather(sizes, weakness, slot, places, candidates, before, own, after, weak)
         for k in range(candidates):
             weak[k] = weakness[slot, places[k]]
     for k in range(BLOCK):  # what a whole vector has beyond the last raises no doubts
-        own[candidates + k] = _0F
+        own[candidates + k] = np.float32(SMALLEST)
 
 
 @_inlined
@@ -453,6 +453,7 @@ def _decide(count, before, own, after, weakness, weak, ore, critical_ratio, verd
     trusted = 1e-25 < critical_ratio < 1e25
     surely = np.float32(critical_ratio * (1.0 + 3e-6) if trusted else np.inf)
     hardly = np.float32(critical_ratio * (1.0 - 3e-6) if trusted else 0.0)
+    floor = np.float32(ore.size_floor)  # nothing below ever breaks; to ask at every new bound would take 4 % longer
     c0, c1, c2, c3, c4, c5, c6, wrong = ore.cushioned
     doubts = np.int32(0)
     for k in range(count):
@@ -468,10 +469,10 @@ def _decide(count, before, own, after, weakness, weak, ore, critical_ratio, verd
         left = (c0 + y * c1) + y2 * ((c2 + y * c3) + y2 * ((c4 + y * c5) + y2 * c6))
         most = ratio * (left + wrong)
         sure = (ratio * (left - wrong) if zz < _UNLIKE else _0F) >= surely
-        doubt = sure != (most >= hardly)
-        verdicts[k] = np.uint8(sure) + np.uint8(2) * np.uint8(doubt)
+        doubt = (sure != (most >= hardly)) & (size >= floor)
+        verdicts[k] = np.uint8(sure & (size >= floor)) + np.uint8(2) * np.uint8(doubt)
         doubts = np.int32(doubts + np.int32(doubt))
-        before[k] = most * _MORE + _LOST
+        before[k] = most * _MORE + _LOST if size >= floor else _NEVER
     return doubts > 0
 
 
@@ -493,24 +494,24 @@ def _decide_by_logarithms(count, sizes, weakness, slot, places, ore, log_stress,
 
 
 @_inlined
-def _list_breaks(candidates, found_bounds, verdicts, bounds, places, own):
-    """Store the bounds found and leave in `places` and `own` those that break; return their number."""
+def _list_breaks(candidates, found_bounds, verdicts, bounds, places):
+    """Store the bounds found and leave in `places` those that break; return their number."""
     # without branches: a mispredicted one costs more than the store
     found = np.int64(0)
     for k in range(candidates):
         p = places[k]
         bounds[p] = found_bounds[k]
-        places[found], own[found] = p, own[k]
+        places[found] = p
         found += verdicts[k]
     return found
 
 
 @_inlined
-def _draw(streams, places, found, whole, states, ratios):
-    """Draw a uniform number for each cell that breaks; what is drawn beyond them, in whole vectors, is not read."""
+def _draw(sizes, streams, places, found, whole, own, states, ratios):
+    """Gather sizes and draw uniform numbers of the cells that break; what is beyond, in whole vectors, is lost."""
     for k in range(found):
         p = places[k]
-        states[k] = streams[p] + _GOLDEN
+        own[k], states[k] = sizes[p], streams[p] + _GOLDEN
         streams[p] = states[k]
     for k in range(whole):
         ratios[k] = uniform(states[k])
@@ -641,10 +642,10 @@ def crush(parcels, passage, path, ore, work, record):
                     if _decide(whole, before, own, after, weakness, weak, ore, critical, verdicts):
                         level = log_stress[line, j]
                         _decide_by_logarithms(count, sizes, weakness, slot, places, ore, level, before, verdicts)
-                found = _list_breaks(count, before, verdicts, bounds, places, own)
+                found = _list_breaks(count, before, verdicts, bounds, places)
                 _count(sizes, places, found, sieves, k, np.int64(-1), counts)
                 whole = (found + 7) // 8 * 8
-                _draw(streams, places, found, whole, states, ratios)
+                _draw(sizes, streams, places, found, whole, own, states, ratios)
                 if ore.fragments == POWER_LAW:
                     exponent, unsure = ore.inverse_exponent, verdicts
                     _raise_ratios(exponent, own, streams, places, found, whole, ore, ratios, exponents, unsure)
