@@ -86,12 +86,6 @@ def test_bias_noise_and_error_are_those_of_the_samples(measured):
     assert measured.sizes["combination"] == 4
 
 
-def test_same_seed_same_figures(measured):
-    again = accuracy.study(paper(), TINY)
-    names = [name for name in measured if not name.endswith("wall_time") and "front" not in name]
-    xr.testing.assert_identical(measured[names], again[names])
-
-
 def test_a_machine_with_a_pressing_force_is_measured_at_the_gap_that_carries_it():
     """The gap given is 55 mm, at which the force would be 3.83 N/mm2."""
     industrial = plain_industrial().with_values({"resolution.cells": 64})

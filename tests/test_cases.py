@@ -6,8 +6,6 @@ import io
 import json
 import os
 import shutil
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -67,16 +65,6 @@ def test_address_tells_seed_replicate_tolerance_and_code_apart():
     assert address(base) == address(base, max_cost=30.0)  # which decides nothing without a tolerance
     assert address(base) == address(base, timeout=3.0)
     assert address(base) == address(base.with_values({"remark": "another"}))
-
-
-@pytest.mark.slow
-def test_address_is_the_same_in_another_process():
-    script = "from support import paper; from studies.sweep.cases import Addresses, SweepSpec\n"
-    script += "print(Addresses(SweepSpec(paper())).of({'rolls.gap': 0.05}, 1))"
-    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    env = os.environ | {"PYTHONPATH": path, "PYTHONHASHSEED": "7"}
-    done = subprocess.run([sys.executable, "-c", script], env=env, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == address(paper(), {"rolls.gap": 0.05}, 1)
 
 
 @pytest.mark.parametrize("file", ["bed/kernels.py", "data/khd_porphyry_feed.csv"])

@@ -475,19 +475,14 @@ def test_module_runs_as_a_command(folder, monkeypatch):
 _LATE = {"numba", "xarray", "matplotlib", "distributed", "dask", "netCDF4", "h5py", "scipy", "pint"}
 
 
-def test_help_explains_every_option_and_loads_nothing_heavy(capsys):
+def test_help_loads_nothing_heavy():
     """What makes `--help` quick, counted in modules rather than seconds."""
     script = "import sys; from studies.gap_sweep import main\ntry: main(['--help'])\nfinally: print(*sys.modules)"
     *told, loaded = python("-c", script).stdout.splitlines()
     assert "studies.command" in loaded.split()
     assert not set(loaded.split()) & _LATE
-    for name in Options.__dataclass_fields__:
-        option = f"--{name.replace('_', '-')}"
-        assert any(option in line for line in told), option
     told = "\n".join(told)
-    assert "python -m studies.gap_sweep" in told
-    for preset in hpgr.presets.NAMES:
-        assert preset in told
+    assert all(word in told for word in ("python -m studies.gap_sweep", "--tolerance", *hpgr.presets.NAMES))
 
 
 @pytest.mark.parametrize("study", commands())

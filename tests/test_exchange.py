@@ -78,18 +78,6 @@ def test_rates_are_never_negative():
 # closure that has speed in it needs another time scale, such as sqrt(s / g) of percolation under gravity.
 
 
-def test_probabilities_per_time_step_do_not_know_the_speed():
-    for factor in (2.0, 0.25, 1024.0):  # powers of two scale floats exactly
-        slow = mixed()
-        fast = slow.with_values({"rolls.speed": factor * slow.rolls.speed})
-        one, other = swap_rates(slow, prepared(slow)), swap_rates(fast, prepared(fast))
-        assert prepared(fast).kinematics.time_step == prepared(slow).kinematics.time_step / factor
-        for name in SwapRates._fields:
-            assert np.array_equal(getattr(one, name), getattr(other, name))
-    other = slow.with_values({"rolls.speed": 3.7 * slow.rolls.speed})
-    assert swap_rates(other, prepared(other)).rise == pytest.approx(one.rise, rel=1e-12)
-
-
 @pytest.mark.parametrize("record", ["cells", "distributions"])
 def test_product_with_exchange_does_not_know_the_speed(record):
     slow = mixed({"resolution.points": 16, "resolution.cells": 24, "resolution.record": record})
@@ -444,39 +432,6 @@ def test_shares_of_the_places_do_not_know_of_each_other(mixing):
     assert not np.array_equal(forward.sizes, np.float32(sizes))
 
 
-# --- the guard of 1/2 --------------------------------------------------------------------------------------
-
-
-def guarded(chance, cells, steps):
-    """Share of the upper box over time, each step split as the lattice splits it."""
-    column = halves(cells, mixing=0.0, seed=8)
-    rates = SwapRates(column.pairs, np.zeros(1), np.array([chance]), np.zeros(1))
-    substeps = int(lattice.substeps_needed(rates, rates.mixing, column.means, 2.0)[0])
-    column.mixing = rates.mixing / substeps
-    shares = []
-    for _ in range(steps):
-        column.swap(substeps)
-        shares.append(np.mean(column.sizes[1] == 2))
-    return np.array(shares)
-
-
-@pytest.mark.parametrize("chance", [0.6, 0.8, 0.95])
-def test_guard_keeps_swaps_from_overshooting(chance, monkeypatch):
-    """With the guard the upper box never holds less of its own than the other; without it, it oscillates about 1/2.
-
-    Binomial noise, 6 sigma: by chance once in 100 million tests.
-    """
-    cells = sized(20_000, 2_000)
-    noise = 6 * 0.5 / math.sqrt(cells)
-    assert guarded(chance, cells, 4).min() > 0.5 - noise
-    monkeypatch.setattr(lattice, "LARGEST_SUM", INF)
-    free = guarded(chance, cells, 4)
-    assert free[0] < 0.5 - noise  # overshoots
-    assert np.allclose(free, 0.5 + (1 - 2 * chance) ** np.arange(1, 5) / 2, atol=noise)
-    if chance >= 0.8:
-        assert np.array_equal(np.sign(free[:3] - 0.5), [-1, 1, -1])
-
-
 # --- diffusion against the error function ------------------------------------------------------------------
 
 
@@ -585,15 +540,6 @@ def test_segregation_and_diffusion_reach_their_exact_balance(large, speed):
     counts = np.array([np.sum(number == k) for k in known])
     assert agrees(counts, weights / weights.sum())
     assert not agrees(counts, np.full(known.size, 1 / known.size))  # and the test can tell
-
-
-def test_without_mixing_large_grains_end_on_top():
-    sizes = np.where(np.arange(3)[:, None] < 1, 0.04, 0.01) * np.ones((3, 200))
-    column = Column(sizes, rise=10.0, mixing=0.0, means=0.02, seed=11)
-    for _ in range(2):  # and stay there; equal grains go on changing places, which nothing sees
-        column.swap(200)
-        assert np.all(column.sizes[2] == np.float32(0.04))
-        assert np.all(column.sizes[:2] == np.float32(0.01))
 
 
 def test_equal_sizes_do_not_segregate():

@@ -263,31 +263,6 @@ def test_both_ways_of_swapping_meet_in_one_scene(monkeypatch):
     assert kinds == {True, False}
 
 
-def test_parcels_shift_one_point_per_step():
-    machine = lattice(small(MARCH_ONLY))
-    machine.advance(0)
-    points = machine.slots.shape[1]
-    for step in range(1, points + 3):
-        before, sizes = machine.slots.copy(), sizes_in(machine)
-        machine.advance(step)
-        assert np.array_equal(machine.slots[:, 1:], before[:, :-1])
-        assert np.array_equal(machine.slots[:, 0], before[:, -1])  # feed takes the place of what left
-        assert np.array_equal(np.sort(machine.slots, axis=None), np.arange(machine.slots.size))
-        assert np.all(sizes_in(machine)[:, 1:] <= sizes[:, :-1])  # only crushed
-
-
-def test_feed_enters_fresh_at_every_step():
-    scene = small(MARCH_ONLY)
-    machine, entered = lattice(scene, seed=12), []
-    for step in range(5):
-        machine.advance(step)
-        entered.append(sizes_in(machine)[:, 0])
-        assert (entered[-1] >= np.float32(0.008)).all()
-        assert (entered[-1] <= np.float32(0.06)).all()
-    entered = np.sort(np.array(entered).reshape(15, -1), axis=1)
-    assert len({row.tobytes() for row in entered}) == 15
-
-
 def test_shares_are_the_parcels_they_came_from(monkeypatch):
     """Cells go to the shares and back, with their strengths; sums are those of the sizes, to 3e-8 of the largest."""
     monkeypatch.setattr(rooms, "_SHARE", 16)
@@ -311,14 +286,6 @@ def test_shares_are_the_parcels_they_came_from(monkeypatch):
 
 
 # --- determinism -------------------------------------------------------------------------------------------
-
-
-def test_same_seed_same_bits_other_seed_other_bits():
-    scene = mixed(STRONG)
-    first = simulate(scene, seed=13)
-    assert first.identical(simulate(scene, seed=13))
-    for seed, replicate in ((14, 0), (13, 1), (14, 1)):
-        assert not np.array_equal(first["size"], simulate(scene, seed=seed, replicate=replicate)["size"])
 
 
 def test_all_cores_give_the_bits_of_one(monkeypatch):
@@ -406,15 +373,6 @@ def test_start_up_begins_with_the_feed_where_nothing_crushes(monkeypatch):
     assert np.array_equal(
         np.sort(swapped.reshape(-1, first.shape[-1]), axis=0), np.sort(first.reshape(-1, first.shape[-1]), axis=0)
     )
-
-
-def test_product_becomes_finer_through_the_start_up():
-    """At the exit the first fill has been crushed once, the last parcel all the way."""
-    size = started({"exchange.interval": 3})["size"].values[:, :, -1].reshape(-1, 3 * sized(40, 20))
-    means = size.mean(axis=1)
-    assert means[0] > 1.5 * means[-3:].mean()
-    crushed = started({"exchange.interval": 3, "exchange.startup": "crushed"})["size"].values[:, :, -1]
-    assert crushed[0].mean() < 0.7 * means[0]
 
 
 def test_product_is_pooled_from_the_steady_snapshots_only():
@@ -515,20 +473,6 @@ def closed_lattice(values, cells, seed):
     sizes = machine.parcels.sizes[:, 1:-1]
     refill(machine, np.random.default_rng(seed).permutation(sizes.ravel()).reshape(sizes.shape))
     return machine, load_bed(inputs_of(scene)).kinematics.y
-
-
-def test_mixing_spreads_marked_cells_over_all_points():
-    """One streamline of grains of its own. The scatter of their share over points falls from 0.47 to under 0.2."""
-    machine, _ = closed_lattice({"exchange.mixing": 2.0, "exchange.segregation": 0.0}, sized(500, 60), seed=20)
-    marked = np.isin(np.arange(machine.slots.size), machine.slots[0])
-    refill(machine, np.where(marked, 0.05, 0.01)[:, None])
-    scatter = []
-    for step in range(sized(60, 30)):
-        machine._swap(step, machine._rates)
-        scatter.append(np.std(np.mean(sizes_in(machine) == np.float32(0.05), axis=2)))
-    assert np.mean(sizes_in(machine) == np.float32(0.05)) == pytest.approx(1 / 3, rel=1e-12)
-    assert scatter[0] < math.sqrt(2) / 3
-    assert 0 < scatter[-1] < 0.2
 
 
 def test_segregation_lifts_large_grains():

@@ -71,14 +71,6 @@ def test_fragments_by_hand_and_back():
     assert law.quantile(law.passing(ratios)) == pytest.approx(ratios)
 
 
-def test_exchange_is_proportional_to_its_coefficients():
-    law = Exchange(segregation=0.2, mixing=0.3)
-    assert law.rising(5.0, 0.5, 4.0) == pytest.approx(0.2 * 5 * 0.5 / 4)
-    assert law.diffusion(5.0, 0.1, 4.0) == pytest.approx(0.3 * 5 / (0.1 * 4))
-    still = Exchange(segregation=0, mixing=0)
-    assert still.rising(5.0, 0.5, 4.0) == still.diffusion(5.0, 0.1, 4.0) == 0
-
-
 def test_percolation_under_gravity_is_never_faster_than_a_grain_falls():
     """v = A gammadot |s - sbar| / (1 + A gammadot |s - sbar| / sqrt(g sbar)), from `ceiling`."""
     law, difference, mean = Exchange(segregation=0.2, percolation="gravity"), 0.01, 0.02

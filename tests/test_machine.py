@@ -104,36 +104,6 @@ def test_power_is_the_integral_of_stress_work_over_the_bed(scene):
     assert performance(fine).power == pytest.approx(exact * scene.rolls.width, rel=2e-4)
 
 
-def test_strains_and_stresses_at_the_gap_are_those_of_the_closed_form():
-    inputs = inputs_of(pilot({"resolution.points": 1601}))
-    _, _, state = bear(inputs, inputs.between_rolls(np.array([0.0, 1.0])))
-    for line in (0, 1):
-        p, q, eps_v, _ = (part[-1] for part in tube(pilot(), float(line))[3])
-        assert state.volumetric_strain[line, -1] == pytest.approx(eps_v, rel=1e-5)
-        assert state.pressure[line, -1] == pytest.approx(p, rel=1e-4)
-        assert state.shear_stress[line, -1] == pytest.approx(q, rel=1e-4)
-
-
-def test_power_is_that_of_plates_closing_on_the_bed():
-    """At small angles each column is pressed as by flat plates: P = 2 U times the integral of normal stress X' dy.
-
-    What is left out is of second order in the angle; it falls accordingly.
-    """
-    left = []
-    for degrees in (2.0, 1.0):
-        angle = math.radians(degrees)
-        rise = 2.8 * (1 - math.cos(angle))  # to 1.4 gaps at the nip: a cake of 0.83
-        rolls = {"rolls.diameter": 2.8, "rolls.gap": 2.5 * rise, "rolls.entry_gap": 4 * rise, "rolls.idle_torque": 0.0}
-        feed = {"kind": "single", "size": 1e-3}
-        scene = pilot(rolls | {"flow.nip_angle": angle, "resolution.points": 401, "feed": feed})
-        y, normal, _, _ = tube(scene, 1.0)
-        bed = inputs_of(scene).between_rolls(np.ones(1))
-        plates = -2 * scene.rolls.surface_speed * np.trapezoid(normal * bed.slope(y), y)
-        left.append(abs(load_bed(inputs_of(scene)).pressed.power / plates - 1))
-    assert left[0] < 0.01
-    assert left[0] / left[1] > 3, left
-
-
 # --- identities ---------------------------------------------------------------------------------------------
 
 
@@ -240,16 +210,6 @@ def test_gap_to_force_and_back(scene):
     force = machine.specific_pressing_force(scene)
     assert operating_gap(scene, force) == pytest.approx(scene.rolls.gap, rel=2e-9)
     assert operating_gap(scene, f"{float(force) / 1e6!r} N/mm^2") == pytest.approx(scene.rolls.gap, rel=2e-9)
-
-
-@floating
-def test_gap_falls_with_force_and_carries_it(scene):
-    force = machine.specific_pressing_force(scene)
-    wanted = force * np.array([0.6, 0.8, 1.0, 1.2, 1.4])
-    found = [machine.float_gap(scene.with_values({"rolls.specific_pressing_force": one})) for one in wanted]
-    gaps = [one.rolls.gap for one in found]
-    assert np.all(np.diff(gaps) < 0)
-    assert [machine.specific_pressing_force(one) for one in found] == pytest.approx(wanted, rel=1e-7)
 
 
 def test_gap_floats_with_the_nip_angle_of_its_cake_held():

@@ -196,22 +196,6 @@ def test_march_is_the_plain_one_on_any_path(c, rates):
     assert np.array_equal(state.on_shear_limit[0], limited)
 
 
-def test_shear_beyond_the_limit_is_taken_as_plastic():
-    scene = constant_phi()
-    state = march(scene, np.full(11, 0.1), np.full(11, 1.0), 0.1)
-    assert state.on_shear_limit[0].tolist() == [False] + [True] * 10
-    ratio = state.shear_stress[0, 1:] / state.pressure[0, 1:]
-    law = scene.elasticity
-    assert ratio == pytest.approx(math.sqrt(4.5 * law.shear_modulus / law.bulk_modulus), rel=1e-9)
-
-
-def test_solid_fraction_is_capped_and_continuity_told():
-    state = march(paper(), np.full(11, 1.0), np.zeros(11), 0.1)
-    assert state.solid_fraction.max() == 0.9
-    assert state.solid_fraction[0, 1] == pytest.approx(0.6 * math.exp(0.1), rel=1e-12)
-    assert state.volumetric_strain[0, -1] == pytest.approx(1.0, rel=1e-12)  # by continuity 0.6 e
-
-
 @pytest.mark.parametrize("c", [-0.5, -0.99])
 @pytest.mark.parametrize("integrator", ["increment", "euler"])
 def test_negative_exponents_are_told_by_both_integrators(integrator, c):
