@@ -562,6 +562,15 @@ def test_the_mean_field_has_become_steady(monkeypatch):
     assert np.allclose(found, rooms.settle(scene, rates, (3, 60), 50).entering, rtol=0.02)
 
 
+def test_what_enters_all_lines_together_is_the_feed():
+    """As the machine is steady: class by class, where swaps across the lattice's first points are many."""
+    scene = mixed(STRONG | {"resolution.points": 60, "resolution.cells": 2})
+    entering = rooms.settle(scene, lattice(scene)._rates, (3, 60), 50).entering
+    assert np.allclose(entering.mean(axis=0), 1 / entering.shape[1], rtol=1e-6)
+    assert np.allclose(entering.sum(axis=1), 1, rtol=1e-12)
+    assert np.ptp(entering, axis=0).max() > 0.1 / entering.shape[1]
+
+
 @pytest.mark.slow
 def test_reduced_lattice_has_the_products_of_the_whole():
     """Means over replicates, of the total and of each line, within 5 standard errors: once in 100,000 tests."""

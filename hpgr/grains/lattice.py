@@ -305,6 +305,9 @@ def settle(scene: Scene, rates: SwapRates, shape: tuple[int, int], first: int) -
     swaps[:] = 0
     kernels.swap_mean_field(flat, sizes, edges._replace(turns=edges.turns[outside == 1]), means, swaps, *work)
     entering = fractions[:, first].copy()
+    for _ in range(20):  # of all lines together it is the feed: edges in another order than among all leave 1 % open
+        entering *= len(entering) / (_CLASSES * entering.sum(axis=0))
+        entering /= entering.sum(axis=1, keepdims=True)
     kernels.swap_mean_field(flat, sizes, edges._replace(turns=edges.turns[outside == 2]), means, swaps, *work)
     return Above(entering, swaps.sum(), most)
 
