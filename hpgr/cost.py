@@ -57,8 +57,11 @@ def predict(scene: Scene) -> Cost:
         size += 40 * cells * min(columns * grid.snapshots, at_once)  # work space
         seconds += product * (0.2e-6 + 0.15e-9 * points + 0.01e-6 * controlled)
     if solver.endswith("lattice"):
-        steps = points + grid.snapshots * exchange.interval
-        frames += -(-2 * points // exchange.interval) if exchange.startup else 0
+        # until the start is forgotten: 1 to 2 times what `lattice.settling` finds for the presets
+        reach = 0.35 * exchange.segregation + 0.6 * math.sqrt(exchange.mixing)
+        settled = math.ceil(points * (1 + reach * scene.feed.largest_grain / scene.rolls.gap))
+        steps = settled + grid.snapshots * exchange.interval
+        frames += -(-settled // exchange.interval) if exchange.startup else 0
         size += 24 * lines * points * cells + 10_000 * lines * points  # parcels; edges of the tessellation
         # the mean field of the reduced lattice takes as long as 700 cells at each point would
         of_step = 4e-7 + 3e-9 * cells if solver == "lattice" else 2e-7 + 3e-10 * cells

@@ -599,9 +599,10 @@ def test_reduced_lattice_begins_above_the_first_break():
 # --- memory ------------------------------------------------------------------------------------------------
 
 
-def test_predicted_memory_counts_the_start_up_snapshots():
+@pytest.mark.parametrize("strength", [{}, {"exchange.segregation": 30}, {"exchange.mixing": 10}])
+def test_predicted_memory_counts_the_start_up_snapshots(strength):
     for record, part in (("cells", "size"), ("distributions", "mass_fraction")):
-        scene = mixed({"exchange.startup": "feed", "exchange.interval": 1, "resolution.record": record})
+        scene = mixed({"exchange.startup": "feed", "exchange.interval": 1, "resolution.record": record} | strength)
         kept = simulate(scene)[part].nbytes
         scant = simulate(scene.with_values({"exchange.startup": None}))[part].nbytes
         more = cost.predict(scene).bytes - cost.predict(scene.with_values({"exchange.startup": None})).bytes
