@@ -144,8 +144,7 @@ class SizeEffectStrength(Frozen):
         cushion = 1 / (2 * self.cushioning * self.cushioning)  # a power would raise where the product is inf
         slope, inverse_size = 3 / self.weibull_modulus, 1 / self.reference_size
         scale, inverse_size = (slope, inverse_size) if slope > 0 else (1.0, 0.0)
-        # stiffer, the polynomial is 0 all the same, and its error would not fit float32
-        cushioning = cushion, _cushioned(min(cushion / scale, 1e12))
+        cushioning = cushion, _cushioned(cushion / scale)
         return StrengthConstants(
             SIZE_EFFECT, slope, scale, *cushioning, self.reference_size, inverse_size, self.scatter
         )
