@@ -4,6 +4,7 @@ Both are in this process and take turns, so that what else the machine does meet
 medians of repeats after one that warms up; of two threads, wall times. Cold starts are fresh processes.
 """
 
+import math
 import os
 import platform
 import resource
@@ -105,6 +106,43 @@ def crushing():
             what = f"march a cell, n = {n:g}, gamma = {gamma:g}, {points:,} points, {cells:,} cells"
             goal = (0.5 if points == 200 else 0.55) if gamma == 1.0 else None
             show(f"{what} ({breaks.sum() / (10 * cells):.2f} breaks)", before, now, goal, "ns")
+
+
+def _march(gamma, harder=0.0):
+    """Return a function that marches ten lines and returns the time, s, and the breaks, both a cell."""
+    scene = hpgr.presets.paper().with_values({"fragments.exponent": gamma})
+    log_stress = scene.strength.log_stress(solve.crushing_stress(scene, load_bed(inputs_of(scene)))) + harder
+    path, ore, lines = march.path(scene, log_stress), march.ore(scene), np.arange(10)
+    passage = kernels.Passage(lines, lines, 0 * lines, 0 * lines + log_stress.shape[1])
+    work, cells = kernels.make_work(scene.resolution.cells), 10 * scene.resolution.cells
+
+    def run():
+        parcels = march.first_cells(scene, 0, [(0, line, 0) for line in lines])
+        start = time.process_time()
+        kernels.crush(parcels, passage, path, ore, work, kernels.Record())
+        return (time.process_time() - start) / cells, parcels.breaks.sum() / cells
+
+    return run
+
+
+def fragments():
+    """A break of other fragments over one of gamma = 1, under the same force, and under one that breaks as often."""
+    for gamma in (0.35, 3.0):
+        other = _march(gamma)
+        low, high, wanted = -5.0, 12.0, other()[1]
+        while high - low > 1e-3:
+            middle = (low + high) / 2
+            low, high = (middle, high) if _march(1.0, middle)()[1] < wanted else (low, middle)
+        for harder, what in ((0.0, "the same force"), (high, f"{math.exp(high):.2g} times the force")):
+            plain = _march(1.0, harder)
+            pairs = [[np.divide(*run()) for run in (plain, other)] for _ in range(101)][1:]
+            breaks = plain()[1], wanted
+            show(
+                f"a break of gamma = {gamma:g} over one of 1, {what} ({breaks[1]:.2f}, {breaks[0]:.2f} breaks a cell)",
+                *np.median(pairs, axis=0),
+                1.2,
+                "ns",
+            )
 
 
 def case():
@@ -270,7 +308,7 @@ def cold():
         show(what, *map(statistics.median, times), goal, "s")
 
 
-ROWS = {each.__name__: each for each in (crushing, case, many, exchange, gap, simulate, control, cold)}
+ROWS = {each.__name__: each for each in (crushing, fragments, case, many, exchange, gap, simulate, control, cold)}
 
 
 def main():

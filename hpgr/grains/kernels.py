@@ -534,7 +534,7 @@ def _fill(exponents, exponent):
 
 
 @_inlined
-def _raise_ratios(exponent, own, streams, places, found, whole, ore, ratios, exponents, unsure):
+def _raise_ratios(exponent, own, streams, places, found, whole, ore, ratios, exponents):
     """Raise the fragment ratios to the exponents of their parents, where there are any.
 
     The library's power, which the bits are defined by, is taken where ours may give another float32: next to a half.
@@ -545,13 +545,13 @@ def _raise_ratios(exponent, own, streams, places, found, whole, ore, ratios, exp
             for k in range(found):
                 exponents[k] = _exponent_of(exponent, own[k], ore)
         for k in range(whole):
-            ratios[k] = _power(ratios[k], exponents[k])
-            size = own[k] * ratios[k]
+            ratio = _power(ratios[k], exponents[k])
+            size = own[k] * ratio
             doubt = np.float32(size * (1.0 - 1e-10)) != np.float32(size * (1.0 + 1e-10))
+            ratios[k] = -ratio if doubt else ratio
             doubts += doubt
-            unsure[k] = doubt
         for k in range(found if doubts else 0):
-            if unsure[k]:
+            if ratios[k] < 0.0:
                 ratios[k] = uniform(streams[places[k]]) ** exponents[k]
 
 
@@ -647,8 +647,8 @@ def crush(parcels, passage, path, ore, work, record):
                 whole = (found + 7) // 8 * 8
                 _draw(sizes, streams, places, found, whole, own, states, ratios)
                 if ore.fragments == POWER_LAW:
-                    exponent, unsure = ore.inverse_exponent, verdicts
-                    _raise_ratios(exponent, own, streams, places, found, whole, ore, ratios, exponents, unsure)
+                    exponent = ore.inverse_exponent
+                    _raise_ratios(exponent, own, streams, places, found, whole, ore, ratios, exponents)
                 _draw_strength(streams, weakness, slot, places, found, ore)
                 _break(sizes, weakness, slot, bounds, places, found, ore, own, ratios)
                 _count(sizes, places, found, sieves, k, np.int64(1), counts)
