@@ -2,8 +2,8 @@
 
 Every figure's difference of means over its standard error, z, for P50, P80 and the fraction below 1 mm of every
 streamline and of all. Were both solvers the same, |z| would exceed 2 in 5 % of the figures. The whole lattice is read
-after its first and its second residence time: of a scene that is not steady after one, the first differs. About 3 s a
-run and scene.
+when it is steady and once more one residence time later: were it not steady, the first would differ. About 3 s a run
+and scene.
 """
 
 import sys
@@ -38,7 +38,7 @@ def reduced_figures(scene, seed):
 
 
 def whole_figures(scene, seed):
-    """Return the figures of a run of the whole lattice, (residence time, figure)."""
+    """Return the figures of a run of the whole lattice, (snapshot, figure)."""
     grid = {"record": "cells", "snapshots": 2}
     ds = hpgr.simulate(scene.with_values({"resolution": grid, "exchange.interval": scene.resolution.points}), seed=seed)
     assert ds.attrs["solver"] == "lattice"
@@ -77,8 +77,8 @@ def main():
         reduced, short = timed(reduced_figures, scene, range(runs))
         whole, long = timed(whole_figures, scene, range(runs, 2 * runs))
         print(f"{name}, {runs} + {runs} runs of {short:.2f} and {long:.2f} s of processor time:")
-        for k, which in enumerate(("first", "second")):
-            show(f"{which} residence time", reduced, whole[:, k], scene.resolution.streamlines)
+        for k, which in enumerate(("first snapshot", "a residence time later")):
+            show(which, reduced, whole[:, k], scene.resolution.streamlines)
 
 
 if __name__ == "__main__":

@@ -163,7 +163,7 @@ def _startup_words(result: xr.Dataset) -> str:
     how = "without exchange" if exchange is None else f"A = {exchange.segregation:g}, B = {exchange.mixing:g}"
     step = 1e3 * float(result["shown_time_step"])
     return (
-        f"Filled with feed, then turning for one residence time; {how}. Grains break once per time\n"
+        f"Filled with feed, then turning until it is steady; {how}. Grains break once per time\n"
         f"step of {step:.3g} ms at most, which paces the first frames; the first of them shows one such step."
     )
 
