@@ -247,7 +247,8 @@ class Frozen(BaseModel):
         except ValidationError as error:
             errors = [_explained(cls, fault) for fault in error.errors(include_url=False)]
             known = cls._known_values(data)
-        errors += [_as_error(fault) for fault in cls._impossible(known)]
+        faults = cls._impossible(known)
+        errors += [_refused(str(fault), tuple(fault.field.split(".")), fault.value) for fault in faults]
         if errors:
             raise ValidationError.from_exception_data(cls.__name__, errors, hide_input=True)
         return model
@@ -349,9 +350,9 @@ def values_of(model: BaseModel) -> dict[str, Any]:
     return flat
 
 
-def _as_error(fault: Fault) -> InitErrorDetails:
-    kind = PydanticCustomError("impossible", "{text}", {"text": str(fault)})
-    return InitErrorDetails(type=kind, loc=tuple(fault.field.split(".")), input=fault.value)
+def _refused(text: str, location: tuple, value: Any) -> InitErrorDetails:
+    kind = PydanticCustomError("refused", "{text}", {"text": text})
+    return InitErrorDetails(type=kind, loc=location, input=value)
 
 
 _BOUNDS = {
@@ -365,12 +366,8 @@ _BOUNDS = {
 def _explained(cls: type[Frozen], error: Any) -> InitErrorDetails:
     """Return pydantic's fault with value, bound and remedy in words; one told already is kept."""
     location = _without_kinds(cls, error["loc"])
-    if error["type"] in {"impossible", "refused"}:
-        kind = PydanticCustomError(error["type"], "{text}", {"text": error["msg"]})
-        return InitErrorDetails(type=kind, loc=location, input=error["input"])
-    text = fault_in_words(cls, location, error)
-    kind = PydanticCustomError("refused", "{text}", {"text": str(text)})
-    return InitErrorDetails(type=kind, loc=location, input=error["input"])
+    text = error["msg"] if error["type"] == "refused" else str(fault_in_words(cls, location, error))
+    return _refused(text, location, error["input"])
 
 
 def _without_kinds(cls: type[Frozen], location: tuple) -> tuple:

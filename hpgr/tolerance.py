@@ -184,8 +184,7 @@ def _smooth_figures(scene: Scene, streamlines: int, points: int, spent: _Purse) 
 def _step(coarse: list[dict], fine: list[dict], name: str) -> tuple[float, float]:
     """Return the relative change from one grid to the next, and its standard error, over paired replicates."""
     changes = np.array([relative(a, b, name) for a, b in zip(coarse, fine, strict=True)])
-    error = changes.std(ddof=1) / math.sqrt(changes.size) if changes.size > 1 else 0.0
-    return float(changes.mean()), float(error)
+    return float(changes.mean()), float(changes.std(ddof=1)) / math.sqrt(changes.size)
 
 
 def _left(step: tuple[float, float], earlier: tuple[float, float]) -> float:
