@@ -2,6 +2,7 @@ import math
 import os
 import subprocess
 import sys
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -140,6 +141,18 @@ def test_refusal_names_the_group_that_it_was_held_against(groups, monkeypatch):
     groups("job/step", needed + 100, 100)
     with pytest.raises(MemoryError, match=f"80% of the {needed:,} bytes that the memory limit of cgroup /job/step"):
         cost.refuse_too_large(paper())
+
+
+def test_parcels_that_share_their_load_do_not_copy_it():
+    size = {"resolution.points": 1000, "resolution.cells": 1, "resolution.snapshots": 1000}
+    scene = paper(size | {"resolution.record": "product"})
+    simulate(scene)
+    tracemalloc.start()
+    try:
+        simulate(scene)
+        assert tracemalloc.get_traced_memory()[1] < cost.predict(scene).bytes + 5e6
+    finally:
+        tracemalloc.stop()
 
 
 TAKEN = {

@@ -123,7 +123,10 @@ def march(
     keys = [(replicate, line % grid.streamlines, snapshot) for (_, _, replicate), snapshot, line in columns]
     lines = np.array([load * shape[2] + line for (_, load, _), _, line in columns])
     product, breaks = np.empty((len(keys), grid.cells), np.float32), np.empty(len(keys), np.int64)
-    ends = np.empty_like(product) if complete else None
+    ends, least = None, None
+    if complete:
+        ends, first = np.empty_like(product), lines.min()
+        least = loads.critical_ratio[first : lines.max() + 1].min(axis=1)[lines - first]
     record, laws = Record(), ore(scene)
     if grid.record == "cells":
         record = Record(snapshots=np.empty((len(keys), points, grid.cells), np.float32))
@@ -145,8 +148,7 @@ def march(
         kernels.crush(parcels, passage, loads, laws, work, own)
         product[part], breaks[part] = parcels.sizes[:, 1:-1], parcels.breaks
         if ends is not None:
-            critical = loads.critical_ratio[lines[part]].min(axis=1)
-            kernels.complete(*parcels[:3], critical, laws.inverse_exponent, laws, work.places)
+            kernels.complete(*parcels[:3], least[part], laws.inverse_exponent, laws, work.places)
             ends[part] = parcels.sizes[:, 1:-1]
 
     step = max(AT_ONCE // grid.cells, 1)
