@@ -53,12 +53,6 @@ def test_outermost_streamline_meets_the_roll_in_value_and_slope(machine):
     assert bed.outer(y + 1j * h).imag / h == pytest.approx(bed.slope(y), rel=1e-12)
 
 
-def test_roll_surface_is_the_circle():
-    bed = bed_of(rolls())
-    y = np.linspace(0, bed.height, 50)
-    assert bed.roll_surface(y) == pytest.approx(roll_surface(rolls(), y), rel=1e-13)
-
-
 def test_outermost_streamline_leaves_the_papers_roll_by_a_few_mm_into_the_gap():
     bed = bed_of(rolls())
     y = np.linspace(0, bed.height, 1001)

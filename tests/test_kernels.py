@@ -280,18 +280,6 @@ def test_a7_halving_grains_end_below_the_critical_size(monkeypatch, critical):
     assert breaks == halvings.sum()
 
 
-def test_cells_break_together_on_the_sizes_before_the_step(monkeypatch):
-    """Synchronous update, by hand: of three cells two break, each judged beside the other unbroken."""
-    kernel = half_every_time(monkeypatch)
-    sizes = np.array([0.04, 0.04, 0.01, 0.01], np.float32)
-    mean, size = (0.04 + 0.04 + 0.01) / 3, 0.04
-    level = -(3 / 3.04) * math.log(size / 0.06) + math.log(size / mean) ** 2 / 2
-    assert list(march(sizes, streams(4), [level + 1e-6], kernel=kernel)[0]) == list(
-        np.array([0.02, 0.02, 0.01, 0.01], np.float32)
-    )
-    assert list(march(sizes, streams(4), [level - 1e-6], kernel=kernel)[0]) == list(sizes)
-
-
 @pytest.mark.parametrize("n", [0.3, 1.0, 3.0])
 def test_a15_dust_shields_a_coarse_grain_by_at_most_its_factor(n):
     """Cushioning factor at most exp((ln 3)^2 / (2 n^2)), reached among dust."""
@@ -300,9 +288,6 @@ def test_a15_dust_shields_a_coarse_grain_by_at_most_its_factor(n):
     bound = critical_log_stress(float(sizes[2])) + math.log(3) ** 2 / (2 * n**2)
     assert march(sizes, streams(5), [bound * (1 + 1e-6)], n=n)[2] == 1
     assert march(sizes, streams(5), [bound * (1 - 1e-6)], n=n)[2] == 0
-
-
-# --- bit-exact relations -----------------------------------------------------------------------------------
 
 
 # --- what holds always -------------------------------------------------------------------------------------
@@ -325,25 +310,11 @@ def test_hundreds_of_breaks_end_at_the_smallest_size():
     assert np.all(found == np.float32(kernels.SMALLEST))
 
 
-def test_no_stress_breaks_nothing():
-    sizes, states = line(100, seed=44)
-    for history in ([], [-INF] * 5):
-        found, after, breaks = march(sizes, states, history)
-        assert np.array_equal(found, sizes)
-        assert np.array_equal(after, states)
-        assert breaks == 0
-
-
 def test_stress_equal_to_the_strength_breaks():
     sizes = np.full(4, 0.06, np.float32)
     level = -(3 / 3.04) * math.log(float(sizes[0]) / 0.06)
     assert march(sizes, streams(4), [level])[2] == 4
     assert march(sizes, streams(4), [level - 1e-12])[2] == 0
-
-
-def test_infinite_stress_breaks_every_cell_above_the_floor():
-    sizes, states = line(50, seed=45)
-    assert march(sizes, states, [INF])[2] == 50
 
 
 # --- sieve classes -----------------------------------------------------------------------------------------

@@ -187,19 +187,6 @@ def test_strain_of_the_papers_bed_converges_at_second_order_from_the_onset_in_it
     assert np.all(fine < coarse / 10)
 
 
-@given(st.floats(0.01, 5.0), st.floats(1e-6, 0.999), st.floats(0.0601, 3.05))
-def test_any_machine_gives_finite_falling_points(exponent, entry_fraction, entry_gap):
-    values = {"flow.exponent": exponent, "flow.entry_fraction": entry_fraction, "rolls.entry_gap": entry_gap}
-    try:
-        bed, motion, strains = moved(paper(values), 11)
-    except ValueError as error:
-        assert "flow.entry_fraction" in str(error)  # noqa: PT017 - the only refusal there is
-        return
-    assert all(np.all(np.isfinite(part)) for part in (*motion, *strains))
-    assert np.all(np.diff(motion.y) < 0)
-    assert np.all(motion.y <= bed.height)
-
-
 @pytest.mark.parametrize("entry_fraction", [1e-9, 1 - 1e-9])
 def test_coinciding_points_are_refused_with_value_bound_and_remedy(entry_fraction):
     words = r"flow.entry_fraction: got 1.* with 2001 points .* at least 1e-09; raise .* or use fewer points"
