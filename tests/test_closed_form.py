@@ -140,6 +140,17 @@ def test_cascade_breaks_one_size_by_its_own_chance(k):
     broken = -np.expm1(-((size / critical) ** (3 * k / law.strength.weibull_modulus)))
     assert passing(size=np.full(3, 0.93 * size)) == pytest.approx(broken, abs=5e-3)  # few fragments are as coarse
     assert np.all(breaks() > broken)
+    assert passing(size=np.full(3, 0.9999 * size)) == pytest.approx(broken, abs=1e-5)  # the rest passes its own size
+    assert np.array_equal(passing(size=np.full(3, size)), np.ones(3))
+
+
+def test_cascade_knows_where_the_size_floor_is():
+    """All that comes near the floor of 1 um breaks: none is left above it, from whatever size the classes count."""
+    law = laws(gamma=0.4, nu=1e-12)
+    for top in (0.0123, 0.03, 0.0611):
+        feed = UniformFeed(bottom_size=0.001, top_size=top)
+        passing, _ = crushed(feed, law.strength, law.fragments, np.array([1e-9]))
+        assert passing(size=np.array([1e-6]))[0] == pytest.approx(1.0, abs=1e-6)
 
 
 def test_scattered_strengths_under_a_stress_that_breaks_finer_grains_than_the_floor():
@@ -156,3 +167,12 @@ def test_far_below_the_size_floor_passing_is_a_power_of_size():
     sizes = np.geomspace(1e-25, 1e-6, 40)
     assert passing(size=sizes[:, None])[:, 0] == pytest.approx((sizes / 1e-6) ** 0.1, rel=1e-3)
     assert percentile(passing, np.array([0.2]), 0.06) == pytest.approx(0.2**10 * 1e-6, rel=1e-2)
+
+
+@pytest.mark.parametrize("critical", [0.0019, 0.00193, 0.00196, 0.002])
+def test_cascade_without_scatter_ends_at_the_critical_size(critical):
+    """A3 within the class of s_c, wherever in it s_c lies: once up to 2e-3 too little passed."""
+    law, sizes = laws(gamma=0.5, nu=1e-12), critical * np.array([0.97, 0.99, 0.999, 1.001])
+    passing, _ = crushed(FEEDS["uniform"], law.strength, law.fragments, np.array([critical]))
+    exact = crushed_passing(FEEDS["uniform"], sizes, critical, 0.5)
+    assert passing(size=sizes[:, None])[:, 0] == pytest.approx(exact, abs=1e-4)

@@ -21,7 +21,7 @@ _nodes = cache(np.polynomial.legendre.leggauss)  # they cost more than the rest 
 _PARTS = 16  # that an interval is divided into while searching
 _FINEST = 1e-30  # m, below any grain; where percentiles are searched from
 _CLASSES = 30  # per factor e in size; passing is then right to 1e-4
-_BELOW_FLOOR = 0.05  # the finest class of the cascade over the size floor
+_BELOW_FLOOR = 3.0  # nepers from the size floor down to the finest class of the cascade
 
 
 def crushed(feed: Feed, strength: Strength, fragments: Fragments, critical: np.ndarray) -> tuple[Callable, Callable]:
@@ -40,7 +40,8 @@ def crushed(feed: Feed, strength: Strength, fragments: Fragments, critical: np.n
     if not breaks.any():  # the feed itself, not its classes
         critical = np.full(critical.shape, np.inf)
         return partial(crushed_passing, feed, critical=critical, gamma=fragments.exponent), lambda: breaks
-    return partial(_between, edges, cumulative.reshape(-1, *critical.shape)), lambda: breaks
+    whole = np.minimum(math.inf if scattered else critical, feed.largest_grain)
+    return partial(_between, edges, cumulative.reshape(-1, *critical.shape), whole), lambda: breaks
 
 
 def _cascade(feed: Feed, strength: Strength, fragments: Fragments, critical: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -51,9 +52,11 @@ def _cascade(feed: Feed, strength: Strength, fragments: Fragments, critical: np.
     that enter, the part b (1 - exp(-a)) / a, a = gamma (1 - b) h, then leaves it in the end.
     """
     top = math.log(feed.largest_grain)
-    lowest = min(math.log(fragments.size_floor * _BELOW_FLOOR), top - 1)  # of a feed below the floor nothing breaks
-    edges = np.linspace(lowest, top, math.ceil((top - lowest) * _CLASSES))
-    width, middle = edges[1] - edges[0], np.exp((edges[1:] + edges[:-1]) / 2)[:, None]
+    floor = min(math.log(fragments.size_floor), top - 1)  # an edge; of a feed below the floor nothing breaks
+    above = math.ceil((top - floor) * _CLASSES)
+    width = (top - floor) / above
+    edges = top - width * np.arange(above + math.ceil(_BELOW_FLOOR / width), -1, -1)
+    middle = np.exp((edges[1:] + edges[:-1]) / 2)[:, None]
     gamma = fragments.exponent_of(middle)
     if math.isinf(strength.scatter):  # a step: the part of the class above s_c breaks
         chance = np.clip((edges[1:, None] - np.log(critical)) / width, 0.0, 1.0)
@@ -72,26 +75,26 @@ def _cascade(feed: Feed, strength: Strength, fragments: Fragments, critical: np.
     kernels.cascade(ever, leaving, np.pad(np.exp(-gamma[:, 0] * width), (1, 0)))
     tries = chance * (1 + chance * (1 - within) / np.maximum(1 - chance, 1e-9 / (gamma * width)))
     cumulative = np.minimum(np.cumsum(ever * (1 - leaving), axis=0), 1.0)
-    cumulative[-1] = 1.0  # but for rounding
+    cumulative[-1] = first if isinstance(feed, SingleFeed) else 1.0  # but for rounding
     return edges, cumulative, first + np.sum(ever[1:] * tries, axis=0)
 
 
-def _between(edges: np.ndarray, cumulative: np.ndarray, size) -> np.ndarray:
+def _between(edges: np.ndarray, cumulative: np.ndarray, whole: np.ndarray, size) -> np.ndarray:
     """Return passing at sizes (..., *line), m, linear in log size between the edges of the cascade's classes.
 
-    Below them, where nothing breaks, it goes on as the power of size that it is across the finest class: exact for
-    fragments of one exponent.
+    All passes `whole`, m, the end of the last class that holds anything. Below the edges, where nothing breaks, passing
+    goes on as the power of size that it is across the finest class: exact for fragments of one exponent.
     """
     size = np.broadcast_to(size, np.broadcast_shapes(np.shape(size), cumulative.shape[1:]))
     cumulative = np.broadcast_to(cumulative, cumulative.shape[:1] + size.shape[size.ndim - cumulative.ndim + 1 :])
-    place = (np.log(size) - edges[0]) / (edges[1] - edges[0])
+    place, end = ((np.log(each) - edges[0]) / (edges[1] - edges[0]) for each in (size, whole))
     before = np.clip(place.astype(int), 0, edges.size - 2)
     lines = np.ogrid[tuple(slice(n) for n in size.shape)][size.ndim - cumulative.ndim + 1 :]
     low, high = cumulative[(before, *lines)], cumulative[(before + 1, *lines)]
     beside = np.divide(low, high, out=np.zeros_like(low), where=high > 0)
-    return np.where(
-        place < 0, low * beside ** np.maximum(-place, 0.0), low + (high - low) * np.minimum(place - before, 1.0)
-    )
+    within = low + (high - low) * (place - before) / np.clip(end - before, 1e-9, 1.0)
+    found = np.where(place < 0, low * beside ** np.maximum(-place, 0.0), within)
+    return np.where(size < whole, found, 1.0)
 
 
 def crushed_passing(feed: Feed, size, critical, gamma: float) -> np.ndarray:
