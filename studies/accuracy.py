@@ -99,7 +99,7 @@ def main(options: Options) -> cli.Report:
     plan = QUICK if options.quick else FULL
     if options.replicates is not None:
         plan = plan._replace(replicates=options.replicates)
-    result = study(cli.base_scene(options.scene), plan, options.seed, progress=True)
+    result = study(cli.base_scene(options), plan, options.seed, progress=True)
     from studies.show import accuracy_tables as tables
     from studies.show.plots.accuracy import accuracy_figure
 

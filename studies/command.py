@@ -108,20 +108,19 @@ class Common:
     overwrite: Overwrite = False
 
 
-def base_scene(options: Any, **resolution: Any) -> Scene:
+def base_scene(options: Any) -> Scene:
     """Return the scene of a preset or file, with the resolution and exchange that are asked for.
 
-    `options` is its name, or has it as `scene` and may have level, cells, points, streamlines and exchange; further
-    values of `Scene.resolution` by name, of which None leaves the scene's. ValueError if there is no such scene.
+    `options` have its name as `scene`, and may have level, cells, points, streamlines and exchange. ValueError if
+    there is no such scene.
     """
-    given = {name: getattr(options, name, None) for name in ("level", "cells", "points", "streamlines")} | resolution
-    given = {name: value for name, value in given.items() if value is not None}
-    level = given.pop("level", None)
-    values = (levels()[level].values() if level else {}) | given
-    scene = _named_scene(options if isinstance(options, str) else options.scene)
-    scene = scene.with_values({f"resolution.{name}": value for name, value in values.items()})
-    on = getattr(options, "exchange", False) and scene.exchange is None
-    return scene.with_values({"exchange": {}}) if on else scene
+    asked = {"resolution": "level"} | {f"resolution.{name}": name for name in ("cells", "points", "streamlines")}
+    values = {field: getattr(options, name, None) for field, name in asked.items()}
+    values = {field: value for field, value in values.items() if value is not None}
+    scene = _named_scene(options.scene)
+    if getattr(options, "exchange", False) and scene.exchange is None:
+        values["exchange"] = {}
+    return scene.with_values(values)
 
 
 def _named_scene(name: str) -> Scene:

@@ -186,7 +186,7 @@ def test_level_sets_the_resolution_and_nothing_else(folder):
     grid, draft = command.base_scene(options).resolution, hpgr.scene.levels()["draft"]
     assert (grid.streamlines, grid.points, grid.cells) == (draft.streamlines, 77, draft.cells)
     assert grid.sieves == (0.001, 0.02)
-    assert command.base_scene("paper", level="draft").resolution.level().startswith("draft")
+    assert command.base_scene(Options(scene="paper", level="draft")).resolution.level().startswith("draft")
 
 
 def test_dry_run_lists_cases_and_writes_nothing(run, folder):
