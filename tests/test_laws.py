@@ -35,17 +35,19 @@ def test_cushioning_only_strengthens_and_by_a_bounded_factor_among_finer_grains(
 @pytest.mark.parametrize("w", [3.04, 1e100, 1e308, INF])
 def test_polynomial_of_cushioning_is_as_wrong_as_it_says(n, w):
     law = Strength(cushioning=n, weibull_modulus=w)
-    mean, size = np.float32(0.01), np.geomspace(0.0034, 0.03, 5000, dtype=np.float32)
+    mean, size = np.float32(0.01), np.geomspace(0.0005, 0.03, 5000, dtype=np.float32)
     size = np.concatenate([size, mean * np.float32(1 + 1e-6 * np.linspace(-1, 1, 50))])
     constants = law.constants()
-    *terms, wrong = constants.cushioned
-    assert wrong < (1e-5 if w == 3.04 and n >= 0.5 else 1e10)
+    *terms, wrong, per_square = constants.cushioned
+    assert wrong < (1e-3 if w == 3.04 and n >= 0.1 else 1e10)
     z = (size - mean) / (size + mean)
-    found = np.polynomial.polynomial.polyval(z * z, terms)
+    part = z * z * per_square
+    found = np.polynomial.polynomial.polyval(np.minimum(part, np.float32(1)), terms)
     assert found.dtype == np.float32
     with np.errstate(over="ignore"):
         exact = np.exp(-(constants.cushion * np.log(size.astype(float) / float(mean)) ** 2) / constants.scale)
-    assert np.all(abs(found - exact) <= wrong)
+    assert np.all(abs(found - exact)[part < 1] <= wrong)
+    assert np.all(exact <= found + wrong)
 
 
 @pytest.mark.parametrize("w", [1.0, 3.04, 30.0])

@@ -26,7 +26,7 @@ from numba.extending import intrinsic
 
 from hpgr import compiler
 from hpgr.laws.fragments import HELD, POWER_LAW
-from hpgr.laws.strength import SIZE_EFFECT, UNLIKE
+from hpgr.laws.strength import SIZE_EFFECT
 
 # Handing the arrays of a step over costs as much as a short loop. A function costs 15 ms to compile, a `min` or `max`
 # of new types 40
@@ -44,7 +44,7 @@ _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
 _SHIFT_30, _SHIFT_27, _SHIFT_31 = np.uint64(30), np.uint64(27), np.uint64(31)
 _SHIFT_12 = np.uint64(12)
-_0F, _1F, _3F, _UNLIKE = np.float32(0.0), np.float32(1.0), np.float32(3.0), np.float32(UNLIKE)
+_0F, _1F, _3F = np.float32(0.0), np.float32(1.0), np.float32(3.0)
 _LOST, _MORE = np.float32(1e-37), np.float32(1.0 + 3e-6)
 _TO_BITS = 1.5 * 2.0**52 + 1023.0
 _1 = np.uint64(1)  # places are unsigned, or every one of them would be tested for being negative
@@ -57,7 +57,7 @@ class Ore(NamedTuple):
     slope: float  # 3 / w
     scale: float  # 3 / w, by which effective size answers to strength; without size effect 1
     cushion: float  # 1 / (2 n^2)
-    cushioned: tuple[np.float32, ...]  # polynomial of what cushioning leaves of the effective size, then its error
+    cushioned: tuple[np.float32, ...]  # polynomial of what cushioning leaves of the effective size, its error, 1 / m
     reference_size: float  # m
     inverse_size: float  # 1 / reference_size; without size effect 0
     scatter: float  # k
@@ -454,7 +454,7 @@ def _decide(count, before, own, after, weakness, weak, ore, critical_ratio, verd
     surely = np.float32(critical_ratio * (1.0 + 3e-6) if trusted else np.inf)
     hardly = np.float32(critical_ratio * (1.0 - 3e-6) if trusted else 0.0)
     floor = np.float32(ore.size_floor)  # nothing below ever breaks; to ask at every new bound would take 4 % longer
-    c0, c1, c2, c3, c4, c5, c6, wrong = ore.cushioned
+    c0, c1, c2, c3, c4, c5, c6, wrong, per_square = ore.cushioned
     doubts = np.int32(0)
     for k in range(count):
         size = own[k]
@@ -463,12 +463,12 @@ def _decide(count, before, own, after, weakness, weak, ore, critical_ratio, verd
             ratio *= weak[k]
         total = (before[k] + after[k]) + size
         z = (_3F * size - total) / (_3F * size + total)
-        zz = z * z
-        y = zz if zz < _UNLIKE else _UNLIKE
+        part = z * z * per_square
+        y = part if part < _1F else _1F
         y2 = y * y
         left = (c0 + y * c1) + y2 * ((c2 + y * c3) + y2 * ((c4 + y * c5) + y2 * c6))
         most = ratio * (left + wrong)
-        sure = (ratio * (left - wrong) if zz < _UNLIKE else _0F) >= surely
+        sure = (ratio * (left - wrong) if part < _1F else _0F) >= surely
         doubt = (sure != (most >= hardly)) & (size >= floor)
         verdicts[k] = np.uint8(sure & (size >= floor)) + np.uint8(2) * np.uint8(doubt)
         doubts = np.int32(doubts + np.int32(doubt))

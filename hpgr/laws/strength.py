@@ -9,7 +9,7 @@ import numpy as np
 from hpgr.fields import Frozen, Metres, Number, Pascals, quantity
 
 SIZE_EFFECT = 0  # tag of the law in the kernels
-UNLIKE = 0.26  # ((s - sbar) / (s + sbar))^2 of a grain that is not finer than a third of its neighbourhood, and a bit
+_HELD = 5.0  # y of exp(-y), by which cushioning holds a grain, beyond which the kernels ask for logarithms
 
 
 class StrengthConstants(NamedTuple):
@@ -27,24 +27,24 @@ class StrengthConstants(NamedTuple):
 
 @lru_cache
 def _cushioned(stiffness: float) -> tuple[np.float32, ...]:
-    """Return the coefficients of a polynomial and its error, in float32.
+    """Return the coefficients of a polynomial, its error and 1 / m, in float32.
 
-    It is exp(-stiffness log(s / sbar)^2), by which cushioning multiplies the effective size, of
-    ((s - sbar) / (s + sbar))^2 from 0 to UNLIKE. The error holds whatever the stiffness, and is small up to about 5.
+    It is exp(-stiffness log(s / sbar)^2), by which cushioning multiplies the effective size, of z^2 / m from 0 to 1,
+    z = (s - sbar) / (s + sbar). Beyond, grains are finer than a ninth of their neighbourhood, or hardly ever break.
+    The error holds whatever the stiffness.
     """
     stiffness = min(stiffness, 1e30)  # float32 holds it; the error has long been above 1, by which nothing is decided
+    most = min(math.tanh(math.sqrt(_HELD / max(stiffness, 1e-9)) / 2), 0.8) ** 2
 
-    def exact(squares):
-        return np.exp(-stiffness * (2 * np.arctanh(np.sqrt(squares))) ** 2)
+    def exact(parts):
+        return np.exp(-stiffness * (2 * np.arctanh(np.sqrt(most * parts))) ** 2)
 
-    nodes = UNLIKE / 2 * (1 - np.cos(np.pi * (np.arange(7) + 0.5) / 7))
+    nodes, parts = (1 - np.cos(np.pi * (np.arange(7) + 0.5) / 7)) / 2, np.linspace(0, 1, 1001)
     terms = np.linalg.solve(np.vander(nodes, increasing=True), exact(nodes))
-    squares = np.linspace(0, UNLIKE, 1001)
-    powers = np.vander(squares, 7, increasing=True)
-    wrong = 2 * np.abs(powers @ terms - exact(squares)).max()
-    # rounding: of the coefficients and the sum 14 times 6e-8 of its terms, and of z 3e-7, at the steepest slope
-    wrong += 1e-6 * (powers[-1] @ np.abs(terms) + math.sqrt(stiffness))
-    return tuple(np.float32([*terms, wrong]))
+    wrong = 2 * np.abs(np.vander(parts, 7, increasing=True) @ terms - exact(parts)).max()
+    # rounding: of the coefficients and the sum 15 times 6e-8 of its terms, and of z 3e-7, at the steepest slope
+    wrong += 1e-6 * (np.abs(terms).sum() + math.sqrt(stiffness))
+    return tuple(np.float32([*terms, wrong, 1 / most]))
 
 
 class SizeEffectStrength(Frozen):
