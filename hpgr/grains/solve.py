@@ -16,7 +16,7 @@ from hpgr.laws.roll_width import WHOLE, Slices
 from hpgr.scene import Scene
 
 _AT_ONCE = 4000  # points whose closed form is taken at once: each takes up to 20 kB
-_TOGETHER = 150_000  # cells of the runs crushed at once: a third less, or four times as many, takes 3 % longer
+_TOGETHER = march.AT_ONCE  # cells of the runs crushed at once, whose work space then stays in cache
 _CONTROLLED_EXPONENT = 10.0  # of fragments; completion takes breaks in proportion to it: seconds at 1e6
 _ROUNDED = 1 + 1.2e-7  # covers the rounding of a size to float32
 FRACTIONS = (0.5, 0.8)  # of the percentiles every product is summarised by
