@@ -4,6 +4,7 @@ The first-order index of a field is the part of a figure's variance that goes wi
 adds what it does together with others (Saltelli et al. 2010). Fields vary independently of each other.
 """
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -138,11 +139,10 @@ def sensitivity(
         return np.array([one.of(result.isel(replicate=0)) for one in wanted])
 
     found = indices(run, len(fields), count, seed)
-    values = {
-        f"{order}{end}": found[k, j] for k, order in enumerate(_ORDERS) for j, end in enumerate(("", "_low", "_high"))
-    }
-    dims = ("figure", "field")
-    own = {name: schema.Variable(dims, "1", f"{name.replace('_', ' ')} Sobol index") for name in values}
+    dims, values, own = ("figure", "field"), {}, {}
+    for (k, order), (j, end) in itertools.product(enumerate(_ORDERS), enumerate(("", "_low", "_high"))):
+        words, part = order.replace("_", " "), f"{end[1:]} end of its 95 % interval" * bool(end)
+        values[order + end], own[order + end] = found[k, j], schema.Variable(dims, "1", f"{words} Sobol index", part)
     own |= {"figure": schema.Variable(("figure",), "", "figure of a run", dtype=None)}
     own |= {"field": schema.Variable(("field",), "", "field of the scene", dtype=None)}
     values |= {"figure": [one.words for one in wanted], "field": list(fields)}

@@ -64,8 +64,8 @@ VARIABLES = {
     "volumetric_strain": Variable(_POINT, "1", "volumetric strain", "since the onset of compaction"),
     "shear_strain": Variable(_POINT, "1", "elastic shear strain", "triaxial, since the onset of compaction"),
     "solid_fraction": Variable(_POINT, "1", "solid fraction"),
-    "pressure": Variable(_POINT, "Pa", "mean stress p", "compression positive"),
-    "shear_stress": Variable(_POINT, "Pa", "shear stress q", "triaxial"),
+    "pressure": Variable(_POINT, "Pa", "mean stress p", "compression positive; in the middle of the roll width"),
+    "shear_stress": Variable(_POINT, "Pa", "shear stress q", "triaxial; in the middle of the roll width"),
     "on_shear_limit": Variable(
         _POINT, "1", "whether on the shear limit", "shear beyond it is taken as plastic", np.int8
     ),
