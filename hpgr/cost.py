@@ -6,10 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import psutil
 
+from hpgr.bed.loaded import inputs_of, load_bed
+from hpgr.grains import lattice
 from hpgr.grains.march import AT_ONCE
-from hpgr.grains.solve import choose, is_controlled
+from hpgr.grains.solve import choose, crushing_stress, is_controlled
 from hpgr.scene import Scene
 
 _SHARE = 0.8  # of the available memory that one scene may take; the rest is for the reader of the result
@@ -57,21 +60,64 @@ def predict(scene: Scene) -> Cost:
         size += 40 * cells * min(columns * grid.snapshots, at_once)  # work space
         seconds += product * (0.2e-6 + 0.15e-9 * points + 0.01e-6 * controlled)
     if solver.endswith("lattice"):
-        # until the start is forgotten: 1 to 2 times what `lattice.settling` finds for the presets
-        reach = 0.35 * exchange.segregation + 0.6 * math.sqrt(exchange.mixing)
-        settled = math.ceil(points * (1 + reach * scene.feed.largest_grain / scene.rolls.gap))
-        steps = settled + grid.snapshots * exchange.interval
-        frames += -(-settled // exchange.interval) if exchange.startup else 0
+        ahead = foresee(scene)
+        last = points + ahead.settling
+        frames += -(-last // exchange.interval) if exchange.startup else 0
         size += 24 * lines * points * cells + 10_000 * lines * points  # parcels; edges of the tessellation
-        # the mean field of the reduced lattice takes as long as 700 cells at each point would
-        of_step = 4e-7 + 3e-9 * cells if solver == "lattice" else 2e-7 + 3e-10 * cells
-        seconds += 5e-5 * lines * points + steps * lines * points * of_step
+        whole = 2e-7 + (1e-9 + 2e-9 * ahead.broken) * cells + (1e-7 + 6e-10 * cells) * ahead.turns  # a step of a point
+        filling = last - (0 if exchange.startup else points / 2)
+        steps = filling + (grid.snapshots - 1) * exchange.interval
+        if solver == "lattice":
+            seconds += 5e-5 * lines * points + steps * lines * points * whole
+        else:  # the mean field, and a lattice of the points past the first break
+            seconds += (2e-5 + filling * (1e-7 + 1.2e-7 * ahead.turns)) * lines * points
+            seconds += steps * ahead.broken**2 * lines * points * whole
     if cells and grid.record == "cells":
         size += 4 * frames * lines * points * cells
         seconds += 1e-9 * frames * lines * points * cells
     elif cells and grid.record == "distributions":
         size += (28 if solver == "closed form" else 16) * frames * lines * points * (len(grid.sieves) + 1)
     return Cost(size, seconds)
+
+
+class Foreseen(NamedTuple):
+    """What a lattice will need, from a bed of few points, in which the feed is still unbroken above the first break."""
+
+    substeps: float  # most of a time step
+    turns: float  # mean over points
+    settling: float  # points, see `hpgr.grains.lattice.settling`
+    broken: float  # share of the points that are past the first break
+
+
+def foresee(scene: Scene) -> Foreseen:
+    """Return what the lattice of a scene that exchanges will need, in 0.5 ms.
+
+    A Voronoi cell is taken for as wide as its tube and as high as a step is long; two of its edges lead along the tube.
+    """
+    exchange, grid, largest = scene.exchange, scene.resolution, scene.feed.largest_grain
+    few = min(grid.points, 41)
+    once = scene.elasticity.model_copy(update={"substeps": 1})
+    try:
+        bed = load_bed(inputs_of(scene)._replace(streamlines=3, points=few, elasticity=once))
+    except ValueError:  # points that coincide: the run will refuse them at once
+        return Foreseen(1.0, 1.0, 0.0, 0.0)
+    first = lattice.first_break(scene, scene.strength.log_stress(crushing_stress(scene, bed)))
+    motion, solid, stretch = bed.kinematics, bed.stress.solid_fraction, (grid.points - 1) / (few - 1)
+    time_step = motion.time_step / stretch
+    width, height = motion.flux / motion.speed / grid.streamlines, motion.speed * time_step
+    sheared = math.sqrt(3) * motion.shear_rate * time_step * solid
+    parcel = scene.rolls.gap / (2 * grid.streamlines) * scene.rolls.surface_speed * time_step * solid[:, -1].mean()
+    mean = np.where(np.arange(few) < first, lattice.class_sizes(scene).mean(), 0.0)
+    along, across = (
+        exchange.diffusion(sheared * edge, distance, parcel) * mean**2
+        for edge, distance in ((width, height), (height, width))
+    )
+    rise = exchange.rising(sheared * width, 1.0, parcel)
+    substeps = 2 * (along + across + rise * largest) / lattice.LARGEST_SUM
+    moved = (rise * (largest - mean)).sum(axis=1) * stretch + 2 * np.sqrt(2 * along.sum(axis=1) * stretch)
+    return Foreseen(
+        float(max(substeps.max(), 1.0)), float(np.ceil(substeps).mean()), float(moved.max()), 1 - first / few
+    )
 
 
 def available_memory() -> tuple[int, str]:

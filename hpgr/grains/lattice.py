@@ -268,7 +268,7 @@ def settling(scene: Scene, rates: SwapRates, unbroken: int, points: int) -> int:
     their own probability, faster where the mean is no longer the feed's; mixing counts with two standard deviations.
     """
     line, point = np.divmod(rates.pairs, points)
-    mean, apart = _class_sizes(scene).mean(), np.abs(np.diff(point)).ravel()
+    mean, apart = class_sizes(scene).mean(), np.abs(np.diff(point)).ravel()
     rises = rates.rise * (scene.feed.largest_grain - np.where(point[:, 0] < unbroken, mean, 0.0)) * apart
     mixes = rates.mixing * (mean * apart) ** 2
     variance = np.bincount(line[:, 0], mixes) + np.bincount(line[:, 1], mixes)
@@ -285,7 +285,7 @@ class Above(NamedTuple):
 
 def settle(scene: Scene, rates: SwapRates, shape: tuple[int, int], first: int) -> Above:
     """Return what enters a lattice at point `first` of a bed (streamline, point) where nothing breaks."""
-    sizes, fractions, most = _class_sizes(scene), np.full((*shape, _CLASSES), 1 / _CLASSES), 1
+    sizes, fractions, most = class_sizes(scene), np.full((*shape, _CLASSES), 1 / _CLASSES), 1
     flat, swaps, work = fractions.reshape(-1, _CLASSES), np.zeros(len(rates.pairs)), np.empty((2, _CLASSES))
 
     def shift(rates):
@@ -312,7 +312,7 @@ def settle(scene: Scene, rates: SwapRates, shape: tuple[int, int], first: int) -
     return Above(entering, swaps.sum(), most)
 
 
-def _class_sizes(scene: Scene) -> np.ndarray:
+def class_sizes(scene: Scene) -> np.ndarray:
     """Return the mean sizes of the feed's classes of equal mass, finest first, m."""
     return scene.feed.quantile((np.arange(8 * _CLASSES) + 0.5) / (8 * _CLASSES)).reshape(_CLASSES, 8).mean(axis=1)
 
