@@ -54,7 +54,7 @@ def predict(scene: Scene) -> Cost:
         seconds += time * (columns + 0.5 * everywhere)
     if cells and not closed:
         product = grid.snapshots * columns * cells
-        at_once = (os.cpu_count() or 1) * max(AT_ONCE // cells, 1)  # parcels
+        at_once = max(AT_ONCE // cells, os.cpu_count() or 1)  # parcels
         size += (12 if slices == 1 else 62) * product  # kept, pooled, sorted; with slices ordered by their shares
         size += 8 * product * controlled  # what cells come to without cushioning, kept and pooled
         size += 40 * cells * min(columns * grid.snapshots, at_once)  # work space

@@ -156,8 +156,10 @@ def march(
             ends[part] = parcels.sizes[:, 1:-1]
 
     with cores(product.size) as shared:
-        step = max(min(AT_ONCE // grid.cells, -(-len(keys) // shared.count)), 1)
-        list(shared.each(crush, [slice(k, k + step) for k in range(0, len(keys), step)]))
+        most = max(AT_ONCE // (shared.count * grid.cells), 1)
+        calls = min(shared.count * -(-len(keys) // (shared.count * most)), len(keys))  # as many for each core
+        bounds = [len(keys) * k // calls for k in range(calls + 1)]
+        list(shared.each(crush, map(slice, bounds, bounds[1:])))
     breaks = breaks.reshape(shape).sum(axis=1)
     parts = product, record.snapshots, record.classes, ends
     product, *kept = (None if part is None else part.reshape(*shape, *part.shape[1:]) for part in parts)
