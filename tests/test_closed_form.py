@@ -104,7 +104,7 @@ def test_cascade_has_the_papers_law_as_its_limit(feed):
     sizes, critical = np.geomspace(2e-6, 0.05, 60), np.array([0.002, 0.02])
     exact = crushed_passing(feed, sizes[:, None], critical, 0.35)
     law = laws(gamma=0.35)
-    edges, cumulative, breaks = _cascade(feed, law.strength, law.fragments, critical)
+    (edges, _, cumulative, _), breaks = _cascade(feed, law.strength, law.fragments, critical)
     found = np.array([np.interp(np.log(sizes), edges, cumulative[:, line]) for line in range(2)]).T
     apart = np.abs(np.log(sizes[:, None] / critical)) > edges[1] - edges[0]  # not within the class of s_c
     assert np.abs(found - exact)[apart].max() < 3e-4
@@ -142,6 +142,19 @@ def test_cascade_breaks_one_size_by_its_own_chance(k):
     assert np.all(breaks() > broken)
     assert passing(size=np.full(3, 0.9999 * size)) == pytest.approx(broken, abs=1e-5)  # the rest passes its own size
     assert np.array_equal(passing(size=np.full(3, size)), np.ones(3))
+
+
+@pytest.mark.parametrize("nu", [0.0, 0.7])
+def test_cascade_leaves_the_feed_where_it_is_within_a_class(nu):
+    """Two sizes, in intervals narrower than a class: once up to half of the feed too much passed the lower edge."""
+    law, critical, sizes = laws(k=2.0, gamma=0.5, nu=nu), np.array([0.01, 0.04]), np.geomspace(0.001, 0.04, 200)
+    table = TableFeed(table=((0.00999, 0.0), (0.01, 50.0), (0.03996, 50.0), (0.04, 100.0)))
+    one, two, both = (
+        crushed(feed, law.strength, law.fragments, critical)[0](size=sizes[:, None])
+        for feed in (SingleFeed(size=0.01), SingleFeed(size=0.04), table)
+    )
+    apart = (np.abs(sizes - 0.00999) > 2e-5) & (np.abs(sizes - 0.03996) > 2e-5)
+    assert both[apart] == pytest.approx((one + two)[apart] / 2, abs=0.01)
 
 
 def test_cascade_knows_where_the_size_floor_is():

@@ -9,6 +9,7 @@ step, the closed forms as often as it takes.
 import math
 from collections.abc import Callable
 from functools import cache, partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,17 +36,27 @@ def crushed(feed: Feed, strength: Strength, fragments: Fragments, critical: np.n
     if not scattered and fragments.size_exponent == 0:
         passing = partial(_crushed_passing, feed, critical, fragments.exponent, 1 - feed.passing(critical))
         return passing, partial(expected_breaks, feed, critical, fragments.exponent)
-    edges, cumulative, breaks = _cascade(feed, strength, fragments, critical.ravel())
+    classes, breaks = _cascade(feed, strength, fragments, critical.ravel())
     breaks = breaks.reshape(critical.shape)
     if not breaks.any():  # the feed itself, not its classes
         critical = np.full(critical.shape, np.inf)
         return partial(crushed_passing, feed, critical=critical, gamma=fragments.exponent), lambda: breaks
     whole = np.minimum(math.inf if scattered else critical, feed.largest_grain)
-    return partial(_between, edges, cumulative.reshape(-1, *critical.shape), whole), lambda: breaks
+    product, left = (each.reshape(-1, *critical.shape) for each in (classes.product, classes.left))
+    return partial(_between, feed, classes._replace(product=product, left=left), whole), lambda: breaks
 
 
-def _cascade(feed: Feed, strength: Strength, fragments: Fragments, critical: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return log edges of size classes, the product's passing there (edge, line), and the breaks per grain (line,).
+class _Classes(NamedTuple):
+    """Size classes of equal widths in log size."""
+
+    edges: np.ndarray  # (edge,) log of sizes in m
+    feed: np.ndarray  # (edge,) passing of the feed there
+    product: np.ndarray  # (edge, line) and of the product
+    left: np.ndarray  # (class, line) part of the feed of a class that is left in it
+
+
+def _cascade(feed: Feed, strength: Strength, fragments: Fragments, critical: np.ndarray) -> tuple[_Classes, np.ndarray]:
+    """Return the classes of the product, and the breaks per grain (line,).
 
     A16, A17: g(s) = f0(s) + int_s^inf g(t) B(t) gamma(t) s^(gamma(t)-1) t^-gamma(t) dt is all grains ever made. Within
     a class, of width h in log size and reached evenly, chance b and exponent gamma are those of its middle. Of grains
@@ -65,34 +76,42 @@ def _cascade(feed: Feed, strength: Strength, fragments: Fragments, critical: np.
     kept = np.maximum(gamma * (1 - chance) * width, 1e-9)
     within = -np.expm1(-kept) / kept
     leaving = np.pad(chance * within, ((1, 0), (0, 0)))
+    left = np.where(chance > 0, 0.0, 1.0) if math.isinf(strength.scatter) else 1 - leaving[1:]
     sizes = np.append(np.exp(edges[:-1]), feed.largest_grain)  # exp(log(s)) may be less than s, which no grain passes
-    feed_passing, first = np.repeat(feed.passing(sizes)[:, None], critical.size, axis=1), 0.0
+    of_feed = feed.passing(sizes)
+    feed_passing, first = np.repeat(of_feed[:, None], critical.size, axis=1), 0.0
     if isinstance(feed, SingleFeed):  # no class: its chance is its own, and what is left of it passes the last edge
         broken = top >= np.log(critical) if math.isinf(strength.scatter) else strength.chance(sizes[-1], critical)
         first = np.where(sizes[-1] < fragments.size_floor, 0.0, broken)
         feed_passing = first * (sizes[:, None] / sizes[-1]) ** fragments.exponent_of(sizes[-1])
+        left[-1] = 1 - first
     ever = np.diff(feed_passing, prepend=0.0, axis=0)
     kernels.cascade(ever, leaving, np.pad(np.exp(-gamma[:, 0] * width), (1, 0)))
     tries = chance * (1 + chance * (1 - within) / np.maximum(1 - chance, 1e-9 / (gamma * width)))
     cumulative = np.minimum(np.cumsum(ever * (1 - leaving), axis=0), 1.0)
-    cumulative[-1] = first if isinstance(feed, SingleFeed) else 1.0  # but for rounding
-    return edges, cumulative, first + np.sum(ever[1:] * tries, axis=0)
+    cumulative[-1] = 1.0  # but for rounding
+    return _Classes(edges, of_feed, cumulative, left), first + np.sum(ever[1:] * tries, axis=0)
 
 
-def _between(edges: np.ndarray, cumulative: np.ndarray, whole: np.ndarray, size) -> np.ndarray:
-    """Return passing at sizes (..., *line), m, linear in log size between the edges of the cascade's classes.
+def _between(feed: Feed, classes: _Classes, whole: np.ndarray, size) -> np.ndarray:
+    """Return passing at sizes (..., *line), m, from that at the edges of the cascade's classes.
 
-    All passes `whole`, m, the end of the last class that holds anything. Below the edges, where nothing breaks, passing
-    goes on as the power of size that it is across the finest class: exact for fragments of one exponent.
+    Within a class fragments are even in log size, and what is left of the feed lies as in the feed. All passes `whole`,
+    m, the end of the last class that holds anything. Below the edges, where nothing breaks, passing goes on as the
+    power of size that it is across the finest class: exact for fragments of one exponent.
     """
+    edges, of_feed, cumulative, left = classes
     size = np.broadcast_to(size, np.broadcast_shapes(np.shape(size), cumulative.shape[1:]))
-    cumulative = np.broadcast_to(cumulative, cumulative.shape[:1] + size.shape[size.ndim - cumulative.ndim + 1 :])
+    axes = size.shape[size.ndim - cumulative.ndim + 1 :]
+    cumulative, left = (np.broadcast_to(each, each.shape[:1] + axes) for each in (cumulative, left))
     place, end = ((np.log(each) - edges[0]) / (edges[1] - edges[0]) for each in (size, whole))
     before = np.clip(place.astype(int), 0, edges.size - 2)
     lines = np.ogrid[tuple(slice(n) for n in size.shape)][size.ndim - cumulative.ndim + 1 :]
     low, high = cumulative[(before, *lines)], cumulative[(before + 1, *lines)]
     beside = np.divide(low, high, out=np.zeros_like(low), where=high > 0)
     within = low + (high - low) * (place - before) / np.clip(end - before, 1e-9, 1.0)
+    even = of_feed[before] + (of_feed[before + 1] - of_feed[before]) * (place - before)
+    within += left[(before, *lines)] * (feed.passing(size) - even)
     found = np.where(place < 0, low * beside ** np.maximum(-place, 0.0), within)
     return np.where(size < whole, found, 1.0)
 
