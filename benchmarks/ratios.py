@@ -160,19 +160,22 @@ def case():
         cases = [space.Case((0,), {"rolls.gap": gaps[k] if apart else 0.06}, k) for k in numbers]
         run.run_batch(space.SweepSpec(scene), cases)
 
-    every = range(CASES)
-    times = turns(lambda: before(every), lambda: now(every), 15)
-    show("case of a sweep, replicates of a point", *(each / CASES for each in times), 0.35)
-    times = turns(lambda: before(every), lambda: now(every, scene=controlled), 15)
-    show("the same with the control variate", *(each / CASES for each in times), 0.35 * 1.15)
-    times = turns(lambda: before(every, True), lambda: now(every, True), 15)
-    show("case of a sweep, each at another gap", *(each / CASES for each in times), 0.35)
-    halves = range(CASES // 2), range(CASES // 2, CASES)
-    with ThreadPoolExecutor(2) as pool:
+    every, halves = range(CASES), (range(CASES // 2), range(CASES // 2, CASES))
+    with ThreadPoolExecutor(1) as worker, ThreadPoolExecutor(2) as workers:  # as the worker threads of sweeps
+
+        def alone(**how):
+            worker.submit(now, every, **how).result()
+
+        times = turns(lambda: before(every), alone, 15)
+        show("case of a sweep, replicates of a point", *(each / CASES for each in times), 0.35)
+        times = turns(lambda: before(every), lambda: alone(scene=controlled), 15)
+        show("the same with the control variate", *(each / CASES for each in times), 0.35 * 1.15)
+        times = turns(lambda: before(every, True), lambda: alone(apart=True), 15)
+        show("case of a sweep, each at another gap", *(each / CASES for each in times), 0.35)
         for scene, what in ((new, ""), (controlled, ", control variate")):
             one, two = turns(
-                lambda scene=scene: now(every, scene=scene),
-                lambda scene=scene: list(pool.map(lambda part: now(part, scene=scene), halves)),
+                lambda scene=scene: alone(scene=scene),
+                lambda scene=scene: list(workers.map(lambda part: now(part, scene=scene), halves)),
                 15,
                 time.perf_counter,
             )

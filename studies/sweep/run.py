@@ -105,24 +105,23 @@ def run_cases(runner: Runner, cases: list[Case]) -> list[CaseResult]:
 
 def _told(spec: SweepSpec, cases: Iterator[Case], results: list[Result]) -> Iterator[CaseResult]:
     """Yield what is told of cases of an operating point that came to results."""
-    known = _KNOWN if spec.whole else _SUMMARY
-    types = {name: known[name].dtype for name in known if results[0].values.get(name) is not None}
     title = "Comminution in high pressure grinding rolls, heterarchical model: one case of a study"
-    stored: dict[str, np.ndarray] = {}
-    before: dict[str, Any] = {}
-    for result, case in zip(results, cases, strict=False):  # of cases no more are taken
-        values = result.values
-        fresh = {  # what replicates share, which is most, once
-            name: np.asarray(values[name], dtype)
-            for name, dtype in types.items()
-            if not before or values[name] is not before[name]
-        }
-        before, stored = values, stored | fresh
+    shared, own = {}, {}  # by replicates, which share most; those of each are stored at once, (replicate, ...)
+    for name, entry in (_KNOWN if spec.whole else _SUMMARY).items():
+        every = [result.values.get(name) for result in results]
+        if any(one is not every[0] for one in every):
+            own[name] = np.array(every, entry.dtype)
+        elif every[0] is not None:
+            shared[name] = np.asarray(every[0], entry.dtype)
+    alike = [value.ravel() for name, value in shared.items() if name in _SUMMARY]
+    finite = np.full(len(results), np.isfinite(np.concatenate(alike)).all())  # one by one takes three times as long
+    for value in own.values():
+        finite &= np.isfinite(value).reshape(len(results), -1).all(axis=1)
+    for k, (result, case) in enumerate(zip(results, cases, strict=False)):  # of cases no more are taken
+        stored = shared | {name: value[k, ...] for name, value in own.items()}
         summary = {name: value for name, value in stored.items() if name in _SUMMARY} if spec.whole else stored
-        seen = [value.ravel() for name, value in fresh.items() if name in _SUMMARY]
-        if not np.isfinite(np.concatenate([[0.0], *seen])).all():  # one by one takes three times as long
+        if not finite[k]:
             broken = [name for name, value in summary.items() if not np.isfinite(value).all()]
-            before = {}  # what is shared may be among it
             yield CaseResult(case.index, "failed", f"not finite: {', '.join(broken)}", {})
         elif not spec.whole:
             yield CaseResult(case.index, "ok", "", summary, result.diagnostics)
