@@ -727,19 +727,15 @@ def _total(sizes, places, per_size):
 
 
 @_inner
-def _copy_there(rows, values, part, slot, places):
+def _copy(rows, values, part, slot, places, back):
+    """Copy a parcel's cells, if there are any, to a share of the places, or back."""
     if rows is not None:
         start = part * values.shape[2] + 1
         for p in range(places):
-            values[part, slot, p] = rows[slot, start + p]
-
-
-@_inner
-def _copy_back(values, rows, part, slot, places):
-    if rows is not None:
-        start = part * values.shape[2] + 1
-        for p in range(places):
-            rows[slot, start + p] = values[part, slot, p]
+            if back:
+                rows[slot, start + p] = values[part, slot, p]
+            else:
+                values[part, slot, p] = rows[slot, start + p]
 
 
 @_compiled
@@ -749,8 +745,8 @@ def spread(parcels, slots, shares, per_size):
     for slot in slots:
         for part in range(shares.totals.shape[0]):
             places = min(share, cells - part * share)
-            _copy_there(parcels.sizes, shares.sizes, part, slot, places)
-            _copy_there(parcels.weakness, shares.weakness, part, slot, places)
+            _copy(parcels.sizes, shares.sizes, part, slot, places, False)
+            _copy(parcels.weakness, shares.weakness, part, slot, places, False)
             shares.totals[part, slot] = _total(shares.sizes[part, slot], places, per_size)
 
 
@@ -763,8 +759,8 @@ def gather(shares, slots, parcels):
             if shares.swapped[part, slot]:
                 shares.swapped[part, slot], parcels.bounds_outdated[slot] = False, True
                 places = min(share, cells - part * share)
-                _copy_back(shares.sizes, parcels.sizes, part, slot, places)
-                _copy_back(shares.weakness, parcels.weakness, part, slot, places)
+                _copy(parcels.sizes, shares.sizes, part, slot, places, True)
+                _copy(parcels.weakness, shares.weakness, part, slot, places, True)
 
 
 @_inlined
