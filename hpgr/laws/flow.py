@@ -28,7 +28,7 @@ class FlowConstants(NamedTuple):
 
 class _Profile(Frozen):
     entry_fraction: Number = quantity(0.02, symbol="y_0/H", source="ours", example=0.02, ge=1e-9, lt=1)
-    """Depth of the first material point as a fraction of the bed's height (v = 0 at depth 0); less where the nip is near."""
+    """Depth of the first material point as a fraction of the bed's height (v = 0 at depth 0); less near a nip."""
 
     def held(self, gap: float, diameter: float, feed_solid_fraction: float) -> Self:
         """Return the profile with what is held while the gap floats; by default nothing."""
