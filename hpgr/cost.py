@@ -61,7 +61,7 @@ def predict(scene: Scene) -> Cost:
         seconds += product * (0.2e-6 + 0.15e-9 * points + 0.01e-6 * controlled)
     if solver.endswith("lattice"):
         ahead = foresee(scene)
-        last = points + ahead.settling
+        last = points + math.ceil(ahead.settling)
         frames += -(-last // exchange.interval) if exchange.startup else 0
         size += 24 * lines * points * cells + 10_000 * lines * points  # parcels; edges of the tessellation
         whole = 2e-7 + (1e-9 + 2e-9 * ahead.broken) * cells + (1e-7 + 6e-10 * cells) * ahead.turns  # a step of a point

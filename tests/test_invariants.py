@@ -237,7 +237,7 @@ def test_scaled_scenes_give_scaled_results(scale, exchange):
     metre and the second. Under a pressing force the gap is a root: to 1e-6.
     """
     judged = 0
-    for scene in drawn(sized(25, 10), exchange):
+    for scene in drawn(sized(40, 10), exchange):
         known = values_of(scene)
         factors = {name: scale_of(field_info(name).unit, **scale) for name in KNOWN}
         changed = {name: known[name] * factor for name, factor in factors.items() if factor != 1 and known.get(name)}
