@@ -85,7 +85,7 @@ class Foreseen(NamedTuple):
 
     substeps: float  # most of a time step
     turns: float  # mean over points
-    settling: float  # points, see `hpgr.grains.lattice.settling`
+    settling: int  # points, see `hpgr.grains.lattice.settling`
     broken: float  # share of the points that are past the first break
 
 
@@ -100,7 +100,7 @@ def foresee(scene: Scene) -> Foreseen:
     try:
         bed = load_bed(inputs_of(scene)._replace(streamlines=3, points=few, elasticity=once))
     except ValueError:  # points that coincide: the run will refuse them at once
-        return Foreseen(1.0, 1.0, 0.0, 0.0)
+        return Foreseen(1.0, 1.0, 0, 0.0)
     first = lattice.first_break(scene, scene.strength.log_stress(crushing_stress(scene, bed)))
     motion, solid, stretch = bed.kinematics, bed.stress.solid_fraction, (grid.points - 1) / (few - 1)
     time_step = motion.time_step / stretch
@@ -116,7 +116,7 @@ def foresee(scene: Scene) -> Foreseen:
     substeps = 2 * (along + across + rise * largest) / lattice.LARGEST_SUM
     moved = (rise * (largest - mean)).sum(axis=1) * stretch + 2 * np.sqrt(2 * along.sum(axis=1) * stretch)
     return Foreseen(
-        float(max(substeps.max(), 1.0)), float(np.ceil(substeps).mean()), float(moved.max()), 1 - first / few
+        float(max(substeps.max(), 1.0)), float(np.ceil(substeps).mean()), math.ceil(moved.max()), 1 - first / few
     )
 
 
