@@ -92,7 +92,8 @@ class Foreseen(NamedTuple):
 def foresee(scene: Scene) -> Foreseen:
     """Return what the lattice of a scene that exchanges will need, in 0.5 ms.
 
-    A Voronoi cell is taken for as wide as its tube and as high as a step is long; two of its edges lead along the tube.
+    A Voronoi cell is taken for as wide as its tube and as high as its neighbours are apart; two of its edges lead along
+    the tube.
     """
     exchange, grid, largest = scene.exchange, scene.resolution, scene.feed.largest_grain
     few = min(grid.points, 41)
@@ -104,7 +105,7 @@ def foresee(scene: Scene) -> Foreseen:
     first = lattice.first_break(scene, scene.strength.log_stress(crushing_stress(scene, bed)))
     motion, solid, stretch = bed.kinematics, bed.stress.solid_fraction, (grid.points - 1) / (few - 1)
     time_step = motion.time_step / stretch
-    width, height = motion.flux / motion.speed / grid.streamlines, motion.speed * time_step
+    width, height = motion.flux / motion.speed / grid.streamlines, np.abs(np.gradient(motion.y, axis=1)) / stretch
     sheared = math.sqrt(3) * motion.shear_rate * time_step * solid
     parcel = scene.rolls.gap / (2 * grid.streamlines) * scene.rolls.surface_speed * time_step * solid[:, -1].mean()
     mean = np.where(np.arange(few) < first, lattice.class_sizes(scene).mean(), 0.0)
