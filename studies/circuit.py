@@ -53,6 +53,10 @@ class Screen(Frozen):
     bypass: Number = quantity(0.0, symbol="1 - C", source="screen", example=0.05, ge=0, le=0.9)
     """Fraction of the fines that goes with the oversize"""
 
+    def __str__(self) -> str:
+        cut = f"oversize of a screen that cuts at {show(self.cut_size, 'm')}"
+        return f"{cut}, sharpness {self.sharpness:g}, bypass {self.bypass:g}"
+
     def oversize(self, size) -> np.ndarray:
         """Return the fraction of grains of a size (m) that goes back."""
         alpha, over = self.sharpness, np.asarray(size, float) / self.cut_size
@@ -68,6 +72,9 @@ class Screen(Frozen):
 
 class EdgeRecycle(Frozen):
     """The product of the roll's edges goes back; the scene needs a roll width."""
+
+    def __str__(self) -> str:
+        return "product of the edges of the rolls"
 
     def split(self, scene: Scene, values: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Return what goes back and what leaves the circuit, by size class, of one unit of the rolls' product."""
@@ -208,7 +215,7 @@ def close_circuit(
     results = [_case(spec, returned, case) for case in space.cases()]
     if not any(one.summary for one in results):
         raise ValueError(results[0].message)
-    return assemble.assemble(spec, space, results, _variables()).assign_attrs(returned=repr(returned))
+    return assemble.assemble(spec, space, results, _variables()).assign_attrs(returned=str(returned))
 
 
 def _case(spec: SweepSpec, returned: Screen | EdgeRecycle, case: Case) -> CaseResult:

@@ -55,7 +55,6 @@ def test_readme_code_runs(tmp_path, monkeypatch, capsys):
     assert len(codes) >= 2
     monkeypatch.chdir(tmp_path)
     Path("mine.toml").write_text(scene + "\n[resolution]\ncells = 60\npoints = 40\nstreamlines = 3\n", encoding="utf-8")
-    Path("my_sieves.csv").write_text("size_mm,percent_passing\n30,100\n10,50\n1,0\n", encoding="utf-8")
     small = ["--cells", "60", "--points", "40", "--streamlines", "3"]
     assert gap_sweep.main([*small, "--no-plot"]) == 0  # what the first command leaves behind
     capsys.readouterr()

@@ -155,7 +155,7 @@ class TableFeed(_Distribution):
 
     kind: Literal["table"] = "table"
     table: Annotated[tuple[tuple[Metres, Number], ...], BeforeValidator(_sieve_rows)] = quantity(
-        symbol="F_0", unit="m, %", source="feed", example="my_sieves.csv"
+        symbol="F_0", unit="m, %", source="feed", example=[["5 mm", 60], ["20 mm", 100]]
     )
     """Rows (size, percent passing), or the path of a CSV file."""
     top_size: Metres | None = quantity(None, symbol="s_max", unit="m", source="feed", example="60 mm", ge=1e-6, le=10)

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from hpgr.fields import show
 from hpgr.results.metrics import scene_of
 from studies.show import report
+from studies.sweep.space import SCENE
 
 _MOST_LINES = 7  # operating points a panel shows; more are thinned evenly, and the figure says so
 _SAME = 1e-6  # relative difference of curves that are drawn as one
@@ -51,8 +52,10 @@ def sweep_figure(result: xr.Dataset, field: str, sieve: float, caption: str) -> 
 
 
 def _title(result: xr.Dataset) -> str:
-    """Return machine, ore and what is swept."""
+    """Return machine, ore and feed, unless there are several, and what is swept."""
     scene, swept = scene_of(result), _joined(report.axes_of(result)) or "nothing"
+    if SCENE in report.axes_of(result):
+        return f"swept: {swept}"
     rolls, ore, feed = scene.rolls, scene.strength, scene.feed
     return (
         f"Rolls {show(rolls.diameter, 'm')} x {show(rolls.width, 'm')}; ore of "
@@ -92,7 +95,8 @@ def _products(panels, result: xr.Dataset, sieve: float) -> bool:
     columns = max(200 // (10 + max(map(len, names), default=1)), 1)  # that the figure is wide enough for
     place = {"loc": "outside upper center", "ncols": min(columns, len(names)), "fontsize": 9, "frameon": False}
     panels[0].figure.legend(handles, names, title=_title(result), **place)
-    _product_sizes(panels[2], points.isel(operating_point=chosen), scene_of(result).feed)
+    of_all = "feed of the first scene" if SCENE in report.axes_of(result) else "feed of the scene"
+    _product_sizes(panels[2], points.isel(operating_point=chosen), scene_of(result).feed, of_all)
     return thinned
 
 
@@ -111,7 +115,7 @@ def _across_half_gap(panel, values: xr.DataArray, xi: np.ndarray, labels: list[s
     return flat
 
 
-def _product_sizes(panel, points: xr.Dataset, feed) -> None:
+def _product_sizes(panel, points: xr.Dataset, feed, name: str) -> None:
     """Draw the size distributions of the whole product at the recorded sieves, and that of the feed, on log axes."""
     sieves, count = points["sieve"].values, points.sizes["operating_point"]
     passing = 100 * points["passing_total"].astype(float).mean("replicate").transpose("operating_point", "sieve").values
@@ -121,9 +125,8 @@ def _product_sizes(panel, points: xr.Dataset, feed) -> None:
         panel.plot(1e3 * sieves[seen], percent[seen], **_style(k, count) | {"markersize": 3})
     seen = (fed > 0) & (np.cumsum(fed >= 100) <= 1)
     panel.plot(1e3 * sieves[seen], fed[seen], color="0.6", linewidth=3, alpha=0.7, zorder=0)
-    middle = np.flatnonzero(seen)[seen.sum() // 2]
-    place = {"xytext": (8, -10), "textcoords": "offset points", "color": "0.4", "fontsize": 9}
-    panel.annotate("feed of the scene", (1e3 * sieves[middle], fed[middle]), **place)
+    # in the corner that no curve of passing reaches
+    panel.text(0.98, 0.02, f"grey: {name}", color="0.4", fontsize=9, ha="right", transform=panel.transAxes)
     panel.set(xscale="log", yscale="log", xlabel="sieve [mm]", ylabel="passing [%]", title="Product of the whole gap")
     panel.set_ylim(0.1, 130)
     low = sieves[np.argmax(passing.max(axis=0) > 0.1)]
