@@ -47,7 +47,8 @@ def bands_table(result: xr.Dataset, sieve: float) -> str:
     for heading, band in bands(result, sieve).items():
         rows = zip(*(part.values.ravel().tolist() for part in band), strict=True)
         columns[heading] = ["{:.4g} ({:.4g} to {:.4g}) ± {:.2g}".format(*row) for row in rows]
-    return report.aligned(list(columns), zip(*columns.values(), strict=True))
+    told = "(mean; in brackets 95 % of what the calibration leaves; ± two standard errors of chance)"
+    return f"{report.aligned(list(columns), zip(*columns.values(), strict=True))}\n{told}"
 
 
 def bands_figure(result: xr.Dataset, sieve: float, caption: str) -> Figure:
