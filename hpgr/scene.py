@@ -38,7 +38,7 @@ from hpgr.fields import (
 from hpgr.laws.elasticity import Elasticity, GranularElasticity
 from hpgr.laws.exchange import Exchange
 from hpgr.laws.feed import Feed
-from hpgr.laws.flow import Flow, PowerFlow, cake_nip_angle, densest_ratio
+from hpgr.laws.flow import LEAST_NIP_ANGLE, Flow, PowerFlow, cake_nip_angle, densest_ratio
 from hpgr.laws.fragments import Fragments, PowerLawFragments
 from hpgr.laws.roll_width import RollWidth
 from hpgr.laws.strength import SizeEffectStrength, Strength
@@ -464,6 +464,10 @@ def _nip_faults(known: dict[str, Any]) -> Iterator[Fault]:
             yield Fault("flow.cake_solid_fraction", f"{cake:g}", bound, "give a lighter cake or a narrower gap")
             return
         angle = cake_nip_angle(gap, diameter, cake / feed, slip)
+        if angle < LEAST_NIP_ANGLE:
+            got, bound = f"{cake:g}, a nip angle of {show(angle, 'rad', 3)}", "must give at least "
+            yield Fault("flow.cake_solid_fraction", got, bound + show(LEAST_NIP_ANGLE, "rad", 3), "give a denser cake")
+            return
     if angle is not None and known.get("rolls.specific_pressing_force") is None and gap < entry_gap:
         nip = gap + diameter * (1 - math.cos(angle))
         if nip > entry_gap:

@@ -381,10 +381,10 @@ def opened_in(browser, path):
 
 
 def requests(browser):
-    """Return the addresses that were asked for, but for data in the page itself."""
+    """Return the addresses that were asked for, but for data in the page itself and the browser's own empty tab."""
     events = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
     found = [event["params"]["request"]["url"] for event in events if event["method"] == "Network.requestWillBeSent"]
-    return [url for url in found if not url.startswith(("data:", "blob:"))]
+    return [url for url in found if not url.startswith(("data:", "blob:", "chrome:"))]
 
 
 @pytest.mark.slow

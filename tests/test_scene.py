@@ -234,6 +234,11 @@ def test_refused_table_entries_name_row_and_column():
     ("values", "refused", "words"),
     [
         ({"cake_solid_fraction": 0.5}, "flow.cake_solid_fraction", "must lie within feed_solid_fraction 0.6 to"),
+        (
+            {"cake_solid_fraction": 0.6},
+            "flow.cake_solid_fraction",
+            "a nip angle of 0 deg; must give at least 0.0573 deg",
+        ),
         ({"nip_angle": "20 deg"}, "rolls.entry_gap", "must be at least 67.2459 mm, the roll distance at the nip"),
         ({"nip_angle": "9 deg", "cake_solid_fraction": 0.8}, "flow.nip_angle", "must be one of nip_angle and cake"),
         ({}, "flow.nip_angle", "got nothing; must be one of nip_angle and cake_solid_fraction"),

@@ -14,6 +14,7 @@ from pydantic import Field
 from hpgr.fields import Fault, Frozen, Number, Radians, default_kind, quantity
 
 POWER, NIP = 0, 1  # tags of the profiles in the kernels
+LEAST_NIP_ANGLE = 1e-3  # rad
 
 
 class FlowConstants(NamedTuple):
@@ -76,7 +77,7 @@ class NipFlow(_Profile):
 
     kind: Literal["nip"] = "nip"
     nip_angle: Radians | None = quantity(
-        None, symbol="alpha", unit="rad", source="machine and ore", example="9 deg", ge=1e-3, lt=math.pi / 3
+        None, symbol="alpha", unit="rad", source="machine and ore", example="9 deg", ge=LEAST_NIP_ANGLE, lt=math.pi / 3
     )
     """Nip angle: where the rolls grip the bed."""
     cake_solid_fraction: Number | None = quantity(
