@@ -6,7 +6,7 @@ import tracemalloc
 from pathlib import Path
 
 import pytest
-from support import paper, sized
+from support import COMPILED, paper, sized
 
 from hpgr import cost, presets, simulate
 
@@ -39,11 +39,12 @@ def test_a_control_variate_costs_a_closed_form_a_column_and_ten_nanoseconds_a_ce
     assert more == pytest.approx(3 * column + 2 * 3 * 64 * 1e-8, rel=1e-9)
 
 
+@pytest.mark.skipif(not COMPILED, reason="Python takes minutes")
 @pytest.mark.parametrize("preset", ["paper", "khd_pilot"])
 @pytest.mark.parametrize("values", [{}, {"exchange.segregation": 3.0}, {"exchange.mixing": 3.0}])
 def test_what_a_lattice_needs_is_foreseen(preset, values):
     """Substeps of the run to a factor of 2.5, as segregation coarsens parcels at the entry; the settling to 1.7."""
-    grid = {"resolution.points": sized(60, 30), "resolution.cells": 20, "exchange": {"startup": "feed", "interval": 1}}
+    grid = {"resolution.points": 60, "resolution.cells": 20, "exchange": {"startup": "feed", "interval": 1}}
     scene = getattr(presets, preset)().with_values(grid | {"resolution.streamlines": 3}).with_values(values)
     found, ahead = simulate(scene), cost.foresee(scene)
     assert isinstance(cost.predict(scene).bytes, int)
@@ -167,7 +168,7 @@ def test_refusal_names_the_group_that_it_was_held_against(groups, monkeypatch):
 
 
 def test_parcels_that_share_their_load_do_not_copy_it():
-    size = {"resolution.points": 1000, "resolution.cells": 1, "resolution.snapshots": 1000}
+    size = {"resolution.points": sized(1000, 50), "resolution.cells": 1, "resolution.snapshots": sized(1000, 20)}
     scene = paper(size | {"resolution.record": "product"})
     simulate(scene)
     tracemalloc.start()

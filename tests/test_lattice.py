@@ -603,7 +603,7 @@ def test_reduced_lattice_begins_above_the_first_break():
 # --- memory ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("strength", [{}, {"exchange.segregation": 30}, {"exchange.mixing": 10}])
+@pytest.mark.parametrize("strength", [{}, {"exchange.segregation": sized(30, 3)}, {"exchange.mixing": sized(10, 0.3)}])
 def test_predicted_memory_counts_the_start_up_snapshots(strength):
     for record, part in (("cells", "size"), ("distributions", "mass_fraction")):
         scene = mixed({"exchange.startup": "feed", "exchange.interval": 1, "resolution.record": record} | strength)
