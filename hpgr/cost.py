@@ -61,7 +61,7 @@ def predict(scene: Scene) -> Cost:
         seconds += product * (0.2e-6 + 0.15e-9 * points + 0.01e-6 * controlled)
     if solver.endswith("lattice"):
         ahead = foresee(scene)
-        last = points + math.ceil(ahead.settling)
+        last = points + ahead.settling
         frames += -(-last // exchange.interval) if exchange.startup else 0
         size += 24 * lines * points * cells + 10_000 * lines * points  # parcels; edges of the tessellation
         whole = 2e-7 + (1e-9 + 2e-9 * ahead.broken) * cells + (1e-7 + 6e-10 * cells) * ahead.turns  # a step of a point
@@ -107,7 +107,7 @@ def foresee(scene: Scene) -> Foreseen:
     time_step = motion.time_step / stretch
     width, height = motion.flux / motion.speed / grid.streamlines, np.abs(np.gradient(motion.y, axis=1)) / stretch
     sheared = math.sqrt(3) * motion.shear_rate * time_step * solid
-    parcel = scene.rolls.gap / (2 * grid.streamlines) * scene.rolls.surface_speed * time_step * solid[:, -1].mean()
+    parcel = lattice.parcel_of(scene, time_step, solid)
     mean = np.where(np.arange(few) < first, lattice.class_sizes(scene).mean(), 0.0)
     along, across = (
         exchange.diffusion(sheared * edge, distance, parcel) * mean**2

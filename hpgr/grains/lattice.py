@@ -44,18 +44,22 @@ class Exchanged(NamedTuple):
     swaps_per_cell: float  # mean number of swaps a cell takes part in during one residence time
 
 
+def parcel_of(scene: Scene, time_step: float, solid_fraction: np.ndarray) -> float:
+    """Return m / rho_b, what a tube lets through in a time step, m2 of solid; solid fraction (streamline, point)."""
+    tube = scene.rolls.gap / (2 * scene.resolution.streamlines)
+    return tube * scene.rolls.speed * scene.rolls.diameter / 2 * time_step * solid_fraction[:, -1].mean()
+
+
 def swap_rates(scene: Scene, bed: LoadedBed) -> SwapRates:
     """Return the swap rates on the edges of a tessellated bed, per time step."""
-    exchange, rolls, cells = scene.exchange, scene.rolls, bed.tessellation
+    exchange, cells = scene.exchange, bed.tessellation
     time_step, solid_fraction = bed.kinematics.time_step, bed.stress.solid_fraction
     lower, upper = cells.pairs.T
 
     def between(field):
         return (field.ravel()[lower] + field.ravel()[upper]) / 2
 
-    tube = rolls.gap / (2 * scene.resolution.streamlines)
-    # m / rho_b: what a tube lets through in a time step, at the local density
-    parcel = tube * rolls.speed * rolls.diameter / 2 * time_step * solid_fraction[:, -1].mean()
+    parcel = parcel_of(scene, time_step, solid_fraction)
     shear_rate = np.sqrt(3) * between(bed.kinematics.shear_rate)
     sheared = cells.length * shear_rate * time_step * between(solid_fraction)
     return SwapRates(

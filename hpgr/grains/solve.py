@@ -16,7 +16,6 @@ from hpgr.laws.roll_width import WHOLE, Slices
 from hpgr.scene import Scene
 
 _AT_ONCE = 4000  # points whose closed form is taken at once: each takes up to 20 kB
-_TOGETHER = march.AT_ONCE  # cells of the runs crushed at once, whose work space then stays in cache
 _CONTROLLED_EXPONENT = 10.0  # of fragments; completion takes breaks in proportion to it: seconds at 1e6
 _ROUNDED = 1 + 1.2e-7  # covers the rounding of a size to float32
 FRACTIONS = (0.5, 0.8)  # of the percentiles every product is summarised by
@@ -137,7 +136,7 @@ def _crush_together(points: list[Loaded], seed: int) -> list[list[Crushed]]:
         highest = log_stress.max(axis=2)[of_point, None]
         complete = [_complete(*one, slices)[0] for one in zip(scenes, highest, strict=True)]
     runs = [(number, of_point[number], replicate) for number, one in enumerate(points) for replicate in one.replicates]
-    step = max(_TOGETHER // (slices.share.size * grid.streamlines * grid.snapshots * grid.cells), 1)
+    step = max(march.AT_ONCE // (slices.share.size * grid.streamlines * grid.snapshots * grid.cells), 1)
     found = []
     for k in range(0, len(runs), step):
         part = runs[k : k + step]

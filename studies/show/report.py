@@ -288,6 +288,11 @@ def any_result(result: xr.Dataset) -> bool:
     return bool((result["status"] == STATUS["ok"]).any())
 
 
+def joined(names: Iterable[str]) -> str:
+    """Return names of axes in words, one after the other."""
+    return ", ".join(name.replace("_", " ") for name in names)
+
+
 def axis_label(axis: xr.DataArray) -> str:
     """Return a swept coordinate's name with the unit it is shown in."""
     name, unit = axis.name.replace("_", " "), _unit(axis)

@@ -31,7 +31,7 @@ def circuit_figure(result: xr.Dataset) -> Figure:
         panel.errorbar(np.arange(len(labels)), values.mean("replicate"), report.spread(values), **style)
         panel.set_ylabel(("circulating load [%], circles", "energy of the product [kWh/t], squares")[k])
     right.set_xticks(np.arange(len(labels)), labels, rotation=20, ha="right")
-    right.set_xlabel(", ".join(name.replace("_", " ") for name in report.axes_of(result)))
+    right.set_xlabel(report.joined(report.axes_of(result)))
     figure.supxlabel(f"Left: {labels[held[0]] or 'the scene'}. Returned: {result.attrs['returned']}.", fontsize=9)
     return figure
 

@@ -39,7 +39,7 @@ def sweep_figure(result: xr.Dataset, field: str, sieve: float, caption: str) -> 
     handles, names = panels[-1].get_legend_handles_labels()
     if names:
         others = [name for name in report.axes_of(result) if name not in axis.dims]
-        figure.legend(handles, names, title=_joined(others), loc="outside right upper", fontsize=9)
+        figure.legend(handles, names, title=report.joined(others), loc="outside right upper", fontsize=9)
     if not sizes:
         figure.suptitle(_title(result), fontsize=11)
     words = [caption] if caption else []
@@ -53,7 +53,7 @@ def sweep_figure(result: xr.Dataset, field: str, sieve: float, caption: str) -> 
 
 def _title(result: xr.Dataset) -> str:
     """Return machine, ore and feed, unless there are several, and what is swept."""
-    scene, swept = scene_of(result), _joined(report.axes_of(result)) or "nothing"
+    scene, swept = scene_of(result), report.joined(report.axes_of(result)) or "nothing"
     if SCENE in report.axes_of(result):
         return f"swept: {swept}"
     rolls, ore, feed = scene.rolls, scene.strength, scene.feed
@@ -195,10 +195,6 @@ def _thinned(numbers: np.ndarray) -> np.ndarray:
     """Return at most a handful of the numbers, evenly chosen."""
     places = np.linspace(0, numbers.size - 1, min(numbers.size, _MOST_LINES)).round().astype(int)
     return numbers[np.unique(places)]
-
-
-def _joined(names: list[str]) -> str:
-    return ", ".join(name.replace("_", " ") for name in names)
 
 
 def _style(k: int, count: int) -> dict:
